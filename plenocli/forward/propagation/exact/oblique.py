@@ -56,10 +56,14 @@ SHARP = 1e-6
 """Blur of a point, in lenslets, below which it is in focus."""
 FINER = 10.0
 """By how much finer a series ends than singular vectors are cut: all of it falls on one column."""
-SKETCH = 64
+BETWEEN = 1.005
+"""Largest sine of the pupil over that of its points which are looked at."""
+SKETCH = 192
 """Columns of the first sketch of a field's singular vectors."""
+SLOW = 8
+"""Places along an axis that carry what of the path no power of ds has."""
 SLAB = 1 << 20
-"""Numbers in a slab of pupil nodes x polynomials, or of pupil nodes x field points."""
+"""Numbers in a slab of pupil nodes x polynomials."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -222,12 +226,14 @@ class _Waves:
 
     def __init__(self, geometry: Geometry) -> None:
         g = self.geometry = geometry
-        turn = np.arange(10) * (math.pi / 5)
-        # a square pupil reaches farther than a round one
-        r = np.array([[0.4], [0.8], [1.1], [1.41]]) * g.D1 / 2
-        self.y, self.x = ((r * f(turn)).ravel() for f in (np.sin, np.cos))
+        turn = np.arange(16) * (math.pi / 8)
+        # up to the corners of a square pupil
+        r = np.array([[0.4], [0.8], [1.1], [1.41422]])
+        self.y, self.x = (
+            (g.D1 / 2 * np.clip(r * f(turn), -1, 1)).ravel() for f in (np.sin, np.cos)
+        )
         s = np.array(_Sphere(g, g.chief, 1 / g.z2, self.y, self.x).sines)
-        self.steepest = float(np.abs(s).max())
+        self.steepest = BETWEEN * float(np.abs(s).max())
         y, x = s / self.steepest
         self.powers = np.stack([y**a * x**b for a, b in FITTED], axis=1)
         self.fit = np.linalg.pinv(self.powers)
@@ -295,6 +301,14 @@ class _Fields:
         )
         wave = np.exp(1j * phase * np.outer(t, self._nodes))
         self._along = [wave * self._nodes**n for n in range(self._powers + 1)]
+        # the series goes slowly with the place
+        few = SLOW + next(
+            (n for n in range(SLOW) if FINER * _interpolated(sum(sizes), n) < tolerance), SLOW
+        )
+        nodes, weights = gauss(few)
+        degrees = np.arange(few) + 0.5
+        self._few = half * nodes
+        self._onto = legendre(t, few, 1) * degrees @ (legendre(nodes, few, 1).T * weights)
         self._blurred = g.blur > SHARP * g.D2
         middle = self._density((0.0, 0.0))
         h = wave @ middle @ wave.T
@@ -305,15 +319,9 @@ class _Fields:
     def of(self, p: Place) -> np.ndarray:
         """F of the point imaged at p (m from the lenslet's centre): (row, column), 1/m."""
         parts = self._shared or self._by_power(self._density(p))
-        out = np.empty(parts[0, 0].shape, complex)
-        step = max(1, SLAB // (len(self._waves.y) * len(self._d)))
-        for start in range(0, len(out), step):
-            some = slice(start, start + step)
-            exponent = self._waves.exponent(p, self._d[some], self._d)
-            fitted = dict(zip(FITTED, np.tensordot(self._waves.fit, exponent, 1)))
-            series = _exponential(fitted, self._powers)
-            out[some] = sum(e * parts[power][some] for power, e in series.items())
-        return out
+        fitted = np.tensordot(self._waves.fit, self._waves.exponent(p, self._few, self._few), 1)
+        series = _exponential(dict(zip(FITTED, fitted)), self._powers)
+        return sum(self._onto @ e @ self._onto.T * parts[power] for power, e in series.items())
 
     def _by_power(self, density: np.ndarray) -> dict[tuple[int, int], np.ndarray]:
         """h_ab/T^(a+b) for all powers."""

@@ -37,7 +37,6 @@ from plenocli.forward.propagation.fresnel.spread_function import separable_field
 from plenocli.forward.propagation.lenslet_fields import FieldNotes, LensletFields, PixelEnergies
 from plenocli.forward.propagation.plan import BandPlan
 from plenocli.forward.propagation.sampling import (
-    FOUND_CUT_EFFECT,
     expected_symmetry,
     size_band,
     superpixels_of,
@@ -56,6 +55,11 @@ MOST_PAIRS = 4000
 """Pairs of a lenslet and a superpixel beyond which a sum over openings is no plan."""
 KERNEL_CUT = 0.1
 """Root mean square that may be left out of the kernel, over the accuracy asked for."""
+CUT_ASIDE = 0.08
+"""Effect of the spread function's cut off the axis on the dimmest column, over the cut and the
+fourth root of the column's light: with it 96 % of 448 foreign cameras' errors were told within a
+factor of ten.
+"""
 TOGETHER = 1 << 22
 """Values on the sensor of points that are gone through together."""
 
@@ -106,8 +110,8 @@ def opening_band(
             "take fewer superpixels or coherent neighbours",
         )
     # off the axis there is more to cut
-    aside = geometry.chief != (0.0, 0.0)
-    moved = aside * FOUND_CUT_EFFECT[1] * base.spread_cut / base.faintest
+    aside, dim = geometry.chief != (0.0, 0.0), math.sqrt(base.faintest)
+    moved = aside * CUT_ASIDE * base.spread_cut / dim
     cut = KERNEL_CUT * accuracy * base.faintest
     parabolic = camera.lenslet_array.profile == "parabolic"
     pairs = {pair for _, pair in _pairs(geometry, superpixels, base.window)}
@@ -116,7 +120,7 @@ def opening_band(
         **vars(base)
         | {
             "lenslet_nodes": max(_count(geometry, parabolic, *pair) for pair in pairs),
-            "sampling": math.hypot(base.sampling, moved, own.lost / base.faintest),
+            "sampling": math.hypot(base.sampling, moved, own.lost / dim),
         },
         kernel_cut=cut,
         kernel_terms=len(own.core),

@@ -51,6 +51,13 @@ def test_a_sample_of_lenslets_off_the_axis_holds(count):
     assert len(summed(cases, count)) >= 4
 
 
+def test_fine_answers_off_the_axis_hold(count):
+    """Missed 2 to 5 times where powers of the pupil's directions were counted by how large an
+    exponent is, not by which of its powers are.
+    """
+    assert all(summed([foreign.oblique_answer(4002, n)], count) for n in (347, 383))
+
+
 def test_a_sample_of_harmonics_holds(count, without_openings):
     cases = [foreign.answer(41, n, "auto") for n in CENTRED]
     assert all(c.rung == "exact, harmonics" for c in summed(cases, count))

@@ -10,6 +10,7 @@ from plenocli.base.errors import NumericsError
 from plenocli.forward.accuracy.dial import plan_pif
 from plenocli.forward.camera.field import shift_of
 from plenocli.forward.camera.geometry import array_position, chief_ray, corner_ray, lenslet_shift
+from plenocli.forward.propagation.exact import oblique
 from plenocli.forward.propagation.system_matrix import PifBuilder
 from tests.forward.propagation.cameras import WAVELENGTH, small_camera
 from tests.forward.propagation.test_exact import errors, image_points
@@ -259,3 +260,23 @@ def test_a_pupil_that_changes_over_the_field_meets_the_oracle(degrees, turn, sha
     )
     assert plan.model == "exact"
     assert worst_error(camera, place, plan, pupil_of=seen) < 1e-3
+
+
+def test_powers_that_an_exponential_is_cut_at_leave_what_is_said():
+    rng, n = np.random.default_rng(3), 400
+    y, x = rng.uniform(-1, 1, (2, n))
+    for size in (1e-3, 0.3, 2.0):
+        parts = {
+            (a, d - a): size * rng.normal(size=n) + 1j * size * rng.normal(size=n)
+            for d in (1, 2, 3, 4)
+            for a in range(d + 1)
+        }
+        values = {power: e * y ** power[0] * x ** power[1] for power, e in parts.items()}
+        sizes = [abs(sum(v for p, v in values.items() if sum(p) == d)).max() for d in (1, 2, 3, 4)]
+        for powers in (0, 1, 3, 6):
+            series = oblique._exponential(parts, powers)
+            cut = sum(e * y ** power[0] * x ** power[1] for power, e in series.items())
+            missed = abs(np.exp(sum(values.values())) - cut).max()
+            assert missed <= oblique._beyond(sizes, powers) * (1 + 1e-9)
+            # at small sizes the first part that is left out is all that there is
+            assert size > 1e-3 or powers > 3 or missed > 0.1 * oblique._beyond(sizes, powers)

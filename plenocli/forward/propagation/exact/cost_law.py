@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from plenocli.forward.propagation.costs import Features, summed
-from plenocli.forward.propagation.exact.oblique import orders_for
+from plenocli.forward.propagation.exact.oblique import field_work, orders_for
 from plenocli.forward.propagation.exact.term_counts import (
     MANY_CELLS,
     ExactBand,
@@ -30,10 +30,8 @@ if TYPE_CHECKING:
     from plenocli.forward.camera.model import Camera
     from plenocli.forward.propagation.plan import BandPlan
 
-OBLIQUE_TERMS, OBLIQUE_NODES = 2.0, 0.07
-"""Terms of the main lens's field off the axis over those on it; what its sum over the pupil takes
-over bringing it into terms, for each node along an axis.
-"""
+OBLIQUE_TERMS = 2.0
+"""Terms of the main lens's field off the axis over those on it."""
 CAUTION = 1.3
 """By how much more terms than expected a field is refused at once rather than after minutes."""
 
@@ -125,7 +123,6 @@ def features(
     wide = item / 8  # what is twice as long takes twice the time
     seconds = {
         "process": 1.0,
-        "field_cubed": wide * field_cubed(camera, geometry, band),
         "spread_values": wide
         * (sizes.lit * sizes.points * sizes.few * band.psf_nodes * terms)
         * orders,
@@ -133,6 +130,7 @@ def features(
         "sensor_values_double" if double else "sensor_values_single": count * fine,
         "written_double" if double else "written_single": written,
     }
+    field = field_seconds(camera, geometry, band, band.cut / 2, wide)
     # the coupling of the own lenslet's terms is dense before it is looked at, and larger seen from
     # superpixels beside it
     own = _pupil_share(camera, n) * own_products(geometry, band, _parabolic(camera), n)
@@ -149,7 +147,9 @@ def features(
     lenslets = min(1.0, n.lenslets_coarse + n.lenslets_a_decade * sizes.decades)
     return Features(
         summed([operations, *(_table_operations(kind, sizes, band) for kind in sizes.kinds)]),
-        summed([seconds, *(_table_seconds(kind, sizes, wide, lenslets) for kind in sizes.kinds)]),
+        summed(
+            [seconds, field, *(_table_seconds(kind, sizes, wide, lenslets) for kind in sizes.kinds)]
+        ),
         tuple(held | _table_bytes(kind, sizes, geometry, item) for kind in sizes.kinds),
     )
 
@@ -181,13 +181,15 @@ def columns(camera: Camera, geometry: Geometry, shape: tuple[int, ...]) -> int:
     return math.ceil(shape[1] * shape[3] / (2 if mirror and is_symmetric(camera) else 1))
 
 
-def field_cubed(camera: Camera, geometry: Geometry, band: BandPlan) -> float:
-    """What bringing the main lens's field into terms goes with: the cube of its nodes, off the axis
-    the fourth power, too.
+def field_seconds(
+    camera: Camera, geometry: Geometry, band: BandPlan, tolerance: float, wide: float
+) -> dict[str, float]:
+    """What bringing the main lens's field into terms consists of; on the axis the cube of its
+    nodes, `wide` times.
     """
     if geometry.chief != (0.0, 0.0):
-        return band.psf_nodes**3 * (1 + OBLIQUE_NODES * band.psf_nodes)
-    return band.psf_nodes**3 / (8 if is_symmetric(camera) else 1)
+        return field_work(geometry, band.half, tolerance)
+    return {"field_cubed": wide * band.psf_nodes**3 / (8 if is_symmetric(camera) else 1)}
 
 
 def _pupil_share(camera: Camera, n: TermLaw) -> float:

@@ -216,6 +216,43 @@ def _sizes(geometry: Geometry) -> tuple[float, list[float], float]:
     )
 
 
+@lru_cache(maxsize=256)
+def _counts(geometry: Geometry, half: float, tolerance: float) -> tuple[int, int, int]:
+    """(nodes of ds along an axis, powers of it, places along an axis at which their coefficients
+    are found) that the field on [-half, half]^2 takes.
+    """
+    g, waves = geometry, _Waves(geometry)
+    phase = g.k * waves.steepest * half
+    # as E is on the lenslets; no field is asked for beyond them
+    places = (half - g.D2 / 2) * np.linspace(-1, 1, 3)
+    parts = [
+        np.abs(waves.parts(waves.exponent((p, q), places - p, places - q)))
+        for p, q in product((-g.D2 / 2, g.D2 / 2), repeat=2)
+    ]
+    sizes = np.max(parts, axis=(0, 2, 3, 4)).tolist()
+    powers = next(
+        (n for n in range(MOST_POWERS) if FINER * _beyond(sizes, n) < tolerance), MOST_POWERS
+    )
+    # coefficients go slowly with the place
+    few = next((n for n in range(SLOW) if FINER * _interpolated(sum(sizes), n) < tolerance), SLOW)
+    return math.ceil(phase + 5 * math.cbrt(phase) + 12), powers, SLOW + few
+
+
+def field_work(geometry: Geometry, half: float, tolerance: float) -> dict[str, float]:
+    """What a field consists of: the pupil on nodes of ds, products of waves and of coefficients,
+    the matrix of all points that is brought into terms.
+    """
+    g, count, orders = geometry, psf_nodes(geometry, half), orders_for(geometry, tolerance)
+    nodes, powers, few = _counts(g, half, tolerance)
+    made = orders**2 if g.blur > SHARP * g.D2 else 1
+    series = (powers + 1) * (powers + 2) / 2
+    return {
+        "aslant_pupil": float(made * nodes**4),
+        "aslant_waves": series * count**2 * (made * nodes + orders**2 * few),
+        "aslant_matrix": float((orders * count) ** 2 * min(orders * count, SKETCH)),
+    }
+
+
 class _Waves:
     """Directions all over the pupil, and what of the path the fit by their powers has.
 
@@ -287,24 +324,11 @@ class _Fields:
         g = self.geometry = geometry
         self._camera, self._d = camera, half * t
         self._waves = _Waves(g)
+        count, self._powers, few = _counts(g, half, tolerance)
+        self._nodes, self._node_weights = gauss(count)
         phase = g.k * self._waves.steepest * half
-        self._nodes, self._node_weights = gauss(math.ceil(phase + 5 * math.cbrt(phase) + 12))
-        # as E is on the lenslets; no field is asked for beyond them
-        places = (half - g.D2 / 2) * np.linspace(-1, 1, 3)
-        parts = [
-            np.abs(self._waves.parts(self._waves.exponent((p, q), places - p, places - q)))
-            for p, q in product((-g.D2 / 2, g.D2 / 2), repeat=2)
-        ]
-        sizes = np.max(parts, axis=(0, 2, 3, 4)).tolist()
-        self._powers = next(
-            (n for n in range(MOST_POWERS) if FINER * _beyond(sizes, n) < tolerance), MOST_POWERS
-        )
         wave = np.exp(1j * phase * np.outer(t, self._nodes))
         self._along = [wave * self._nodes**n for n in range(self._powers + 1)]
-        # the series goes slowly with the place
-        few = SLOW + next(
-            (n for n in range(SLOW) if FINER * _interpolated(sum(sizes), n) < tolerance), SLOW
-        )
         nodes, weights = gauss(few)
         degrees = np.arange(few) + 0.5
         self._few = half * nodes

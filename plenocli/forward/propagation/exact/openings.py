@@ -28,7 +28,7 @@ import numpy as np
 from plenocli.base.errors import NumericsError
 from plenocli.forward.camera.quadrature import gauss, nodes_for, opening_weights
 from plenocli.forward.propagation.costs import Features
-from plenocli.forward.propagation.exact.cost_law import OBLIQUE_TERMS, columns, field_cubed
+from plenocli.forward.propagation.exact.cost_law import OBLIQUE_TERMS, columns, field_seconds
 from plenocli.forward.propagation.exact.debye import spherical_field
 from plenocli.forward.propagation.exact.oblique import at_points, oblique_field, orders_for
 from plenocli.forward.propagation.exact.residual import Residual, path
@@ -390,9 +390,9 @@ def features(
             "sensor_values": twice * tall * wide * lit * len(nodes),
             "kernel_values": float(nodes.mean()) * r * (tall + wide) * parts * pairs,
             "spread_values": orders * pairs * parts * most * lines * band.psf_nodes * terms,
-            "field_cubed": twice * field_cubed(camera, g, band),
             "written": math.prod(shape[1:]),
-        },
+        }
+        | field_seconds(camera, g, band, band.spread_cut, twice),
         (
             {
                 "process": 1.0,

@@ -410,10 +410,15 @@ def _cluster(scheduler: str) -> Iterator[Any]:
                 note(f"the scheduler at {scheduler} has no workers yet; waiting for the first")
                 client.wait_for_workers(1)
             yield client
-    except OSError as error:
-        if error.errno is not None:  # of a file, not of Dask
+    except Exception as error:
+        of_dask = isinstance(error, OSError) and error.errno is None  # else of a file
+        if not of_dask and type(error).__name__ not in _GONE:
             raise
         raise _broken(error) from None
+
+
+_GONE = ("CancelledError", "FutureCancelledError", "CommClosedError", "ClosedClientError")
+"""What Dask raises where its scheduler is gone."""
 
 
 _TLS = {"ca": "tls_ca_file", "cert": "tls_client_cert", "key": "tls_client_key"}
@@ -484,7 +489,7 @@ def _trouble(error: Exception) -> PlenoError | None:
             "--scheduler",
             "install the same plenocli and its extras where the workers run",
         )
-    if name in ("CancelledError", "FutureCancelledError", "CommClosedError"):
+    if name in _GONE:
         return _broken(error)
     return None
 

@@ -197,6 +197,35 @@ def test_what_is_said_is_heard_by_this_thread_only(capsys):
     assert said == ["one"] and capsys.readouterr().err == "plenocli: two\n"
 
 
+def test_a_scheduler_that_goes_while_tasks_are_given_up_is_no_bug(monkeypatch):
+    """Dask then says so of `cancel`, at the end."""
+    distributed = pytest.importorskip("distributed")
+    from distributed.client import ClosedClientError
+
+    class Client:
+        def __init__(self, *_, **__):
+            pass
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_):
+            pass
+
+        def nthreads(self):
+            return {1: 1}
+
+        def get_executor(self, **_):
+            return self
+
+        def shutdown(self, **_):
+            raise ClosedClientError("Client is closed. Can't send cancel-keys message.")
+
+    monkeypatch.setattr(distributed, "Client", Client)
+    with pytest.raises(Lost, match="run again"), open_pool(1, "tcp://127.0.0.1:1"):
+        pass
+
+
 @pytest.mark.parametrize("address", ["nowhere", "tcp://127.0.0.1:1"])
 def test_a_cluster_that_is_not_there_is_a_usage_error(address):
     pytest.importorskip("distributed")

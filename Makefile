@@ -40,7 +40,7 @@ $(TOOLS)/.ready: constraints.txt
 	@touch $@
 
 requirements: $(TOOLS)/.ready ## requirements.txt anew: the hashes of all files of the versions in constraints.txt
-	$(TOOLS)/bin/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header --no-annotate \
+	$(TOOLS)/bin/uv pip compile --quiet --upgrade --universal --python-version 3.11 --generate-hashes --no-header --no-annotate \
 	  --extra plot --extra fast --extra ml --extra dev -c constraints.txt pyproject.toml -o requirements.txt
 
 sbom: $(READY) $(TOOLS)/.ready ## what the environment holds, with licences, as CycloneDX: dist/sbom.json

@@ -9,7 +9,6 @@ import os
 import re
 import subprocess
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from plenocli.base.errors import InputError, OutputError
@@ -24,22 +23,6 @@ _LINE = re.compile(rb"(\\?)([0-9a-f]{64})  (.+)", re.DOTALL)
 _ESCAPES = {b"\\\\": b"\\", b"\\n": b"\n", b"\\r": b"\r"}
 _MOST_BYTES = 64 << 20
 _OF_NOTHING = hashlib.sha256().hexdigest()
-
-
-@dataclass(frozen=True, kw_only=True)
-class Differences:
-    """A folder against a manifest; names within the folder, sorted.
-
-    altered: files of other bytes.
-    missing: files that are listed but gone.
-    unlisted: files that are there but not listed.
-    same: number of the others.
-    """
-
-    altered: tuple[str, ...] = ()
-    missing: tuple[str, ...] = ()
-    unlisted: tuple[str, ...] = ()
-    same: int = 0
 
 
 def digests(root: Path) -> dict[str, str]:
@@ -139,13 +122,14 @@ def _unescaped(written: bytes) -> bytes:
     return re.sub(rb"\\[\\nr]", lambda found: _ESCAPES[found[0]], written)
 
 
-def differences(found: Mapping[str, str], listed: Mapping[str, str]) -> Differences:
-    """What a folder holds (`digests`) against what a manifest says."""
-    return Differences(
-        altered=tuple(sorted(n for n in found if listed.get(n, found[n]) != found[n])),
-        missing=tuple(sorted(listed.keys() - found.keys())),
-        unlisted=tuple(sorted(found.keys() - listed.keys())),
-        same=sum(listed.get(name) == digest for name, digest in found.items()),
+def differences(found: Mapping[str, str], listed: Mapping[str, str]) -> tuple[str, ...]:
+    """What a folder holds (`digests`) against what a manifest says: sorted names of the folder,
+    each with what is wrong with it.
+    """
+    names = sorted(n for n in found.keys() | listed.keys() if found.get(n) != listed.get(n))
+    return tuple(
+        f"{n} {'missing' if n not in found else 'altered' if n in listed else 'not listed'}"
+        for n in names
     )
 
 

@@ -76,16 +76,7 @@ def _seal_folder(root: Path, key: Path | None) -> Sealed:
     found = manifest.digests(root)
     changes = None
     if (root / manifest.NAME).exists():
-        since = manifest.differences(found, manifest.read_manifest(root))
-        changes = tuple(
-            f"{name} {verb}"
-            for names, verb in (
-                (since.altered, "altered"),
-                (since.missing, "gone"),
-                (since.unlisted, "new"),
-            )
-            for name in names
-        )
+        changes = manifest.differences(found, manifest.read_manifest(root))
     manifest.write_manifest(root, found, key)
     return Sealed(path=root, files=len(found), changes=changes)
 

@@ -103,7 +103,7 @@ def seed_of(name):
 @pytest.mark.parametrize("name", STORED)
 def test_no_damaged_artefact_is_read(runner, stages, tmp_path, campaign, count, name):
     bench, tried = Bench(runner, stages, tmp_path, name), 0
-    for number, bad in enumerate(mutants(bench.good, campaign(8, 900), seed_of(name))):
+    for number, bad in enumerate(mutants(bench.good, campaign(8, 450), seed_of(name))):
         command = STORED[name] if number % 4 == 0 else ["inspect", "X"]
         assert is_clean_refusal(bench.run(bad, command), 3, name), number
         tried += 1

@@ -154,7 +154,7 @@ def test_a_disk_may_be_full_at_any_byte(runner, workshop, campaign, count, name)
 
 @pytest.mark.parametrize("name", STAGES)
 def test_any_array_may_find_no_memory(runner, workshop, campaign, count, name):
-    """The first 100 arrays one by one, then ever farther apart, until none is left:
+    """The first 30 arrays one by one, then ever farther apart, until none is left:
     once or from there on.
     """
     folder, ready = workshop
@@ -174,7 +174,7 @@ def test_any_array_may_find_no_memory(runner, workshop, campaign, count, name):
             or is_clean_refusal(outcome, (4, 5), "memory")
             and is_old_or_new(target, whole)
         ), (nth, outcome)
-        nth = max(nth + 1, int(nth * campaign(3, 1.04 if nth > 100 else 1)))
+        nth = max(nth + 1, int(nth * campaign(3, 1.1 if nth > 30 else 1)))
     assert points >= 3
     count("allocation failing, n-th array", points=points, signals=0, old_files_lost=0)
 
@@ -185,7 +185,7 @@ def test_any_limit_of_memory(runner, workshop, campaign, count, name):
     folder, ready = workshop
     limits = campaign(
         (0, 10**6, 260 << 20),
-        (0, *(int(3000 * 1.9**step) for step in range(18)), 257 << 20, 300 << 20, 400 << 20),
+        (0, *(int(3000 * 3.5**step) for step in range(9)), 257 << 20, 300 << 20, 400 << 20),
     )
     for room in limits:
         command, target, whole = ready(name)

@@ -237,6 +237,11 @@ def _scheduler(arguments):
 def _worker(arguments):
     from distributed import Worker
 
+    from plenocli.files import outside
+
+    # what decodes files is forked while there is one thread: later it would be a start of Python
+    outside._idle.append(outside._taken()[0])
+
     async def serve():
         where = {"scheduler_file": arguments[0], "local_directory": str(Path(arguments[0]).parent)}
         async with Worker(**where, nthreads=1, dashboard=False) as worker:

@@ -6,7 +6,25 @@ import json
 import math
 import re
 from collections.abc import Iterable
+from dataclasses import asdict, dataclass, fields, is_dataclass
 from typing import Any
+
+
+@dataclass(frozen=True)
+class Record:
+    """What stands in artefacts and summaries as its fields by name."""
+
+    def as_json(self) -> dict[str, Any]:
+        """The fields by name."""
+        return {field.name: _by_name(getattr(self, field.name)) for field in fields(self)}
+
+
+def _by_name(value: Any) -> Any:
+    if isinstance(value, (list, tuple)):
+        return [_by_name(item) for item in value]
+    if hasattr(value, "as_json"):
+        return value.as_json()
+    return asdict(value) if is_dataclass(value) and not isinstance(value, type) else value
 
 
 def json_value(value: Any) -> Any:

@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from plenocli.base.text import Record
+
 
 @dataclass(frozen=True)
 class Parameter:
@@ -27,15 +29,11 @@ class Parameter:
 
 
 @dataclass(frozen=True)
-class Metric:
+class Metric(Record):
     """A column of figures: its name and what it means."""
 
     name: str
     meaning: str
-
-    def as_json(self) -> dict[str, Any]:
-        """As artefacts hold it."""
-        return {"name": self.name, "meaning": self.meaning}
 
 
 @dataclass(frozen=True, kw_only=True)

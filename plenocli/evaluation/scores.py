@@ -4,11 +4,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from plenocli.base.text import Record
 from plenocli.evaluation.metrics.figures import Figure
 
 
 @dataclass(frozen=True, kw_only=True)
-class PatchScore:
+class PatchScore(Record):
     """What one patch of a chart shows beside its truth, lists by band.
 
     label: 1 to 24, row by row.
@@ -23,18 +24,6 @@ class PatchScore:
     std: list[float]
     truth: list[float] | None = None
     one_of_six: bool
-
-    def as_json(self) -> dict[str, Any]:
-        """As it stands in a score document."""
-        return {
-            "label": self.label,
-            "name": self.name,
-            "lenslets": self.lenslets,
-            "mean": self.mean,
-            "std": self.std,
-            "truth": self.truth,
-            "one_of_six": self.one_of_six,
-        }
 
 
 @dataclass(frozen=True, kw_only=True)

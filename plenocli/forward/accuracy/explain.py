@@ -6,9 +6,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
+from plenocli.base.text import Record
 from plenocli.forward.accuracy.dial import seconds_here
 from plenocli.forward.propagation.costs import law
 from plenocli.forward.propagation.diagnosis import seconds as diagnosis_seconds
@@ -126,7 +127,7 @@ def explain(plan: PifPlan, memory: int | None = None, took: CommandSeconds | Non
 
 
 @dataclass(frozen=True, kw_only=True)
-class Considered:
+class Considered(Record):
     """A model that a plan considered; None where nothing is known, since it does not serve.
 
     rung: its name;
@@ -146,10 +147,6 @@ class Considered:
     coherent_ring: int | None
     seconds: float | None
     bytes: int | None
-
-    def as_json(self) -> dict[str, Any]:
-        """The fields by name."""
-        return asdict(self)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -3,14 +3,14 @@ error of the model.
 """
 
 import math
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
+from plenocli.base.text import Record
 from plenocli.forward.propagation.accuracy_record import AccuracyRecord
 
 
 @dataclass(frozen=True, kw_only=True)
-class Limits:
+class Limits(Record):
     """Noise against model error, both relative to the capture's root mean square.
 
     limited_by: "noise" or "model", whichever is larger;
@@ -21,10 +21,6 @@ class Limits:
     model_error: float
     limited_by: str
     reason: str
-
-    def as_json(self) -> dict[str, Any]:
-        """The fields by name."""
-        return asdict(self)
 
 
 def what_limits(

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from plenocli.inverse.fit.evidence import Evidence, EvidenceAt
-from plenocli.inverse.fit.finer import FinerModel
 from plenocli.inverse.fit.lenslet import LensletFamily, MatrixAt
 from plenocli.inverse.fit.optics import CameraFamily
 
@@ -100,7 +99,7 @@ class Ascent:
         evidence: Evidence,
         *,
         tolerance: float = 1e-5,
-        model: FinerModel | None = None,
+        model: Callable[[np.ndarray], np.ndarray] | None = None,
         rounds: int = 0,
         progress: Callable[[], object] | None = None,
     ) -> None:
@@ -184,7 +183,7 @@ class Ascent:
         if self._model is None:
             return None
         values = self.values(x)
-        return self._model.matrix(values) - self.lenslets.at(values).matrix
+        return self._model(values) - self.lenslets.at(values).matrix
 
     def climb(self, at: Point, steps: int, least: float = 1.0) -> Point:
         """The Point where going on from one gains nothing, or after so many steps; what a finer

@@ -14,7 +14,7 @@ from plenocli.base.errors import ConfigError
 from plenocli.inverse.fit.ascent import Ascent, Point
 from plenocli.inverse.fit.camera_fit import CameraFit, FittedParameter
 from plenocli.inverse.fit.captures import Mender
-from plenocli.inverse.fit.finer import FinerModel
+from plenocli.inverse.fit.finer import finer_matrix
 from plenocli.inverse.fit.optics import ZERNIKES, Parameter, require_fittable
 from plenocli.inverse.fit.problem import CapturedLenslets, FitProblem, described_matrix, fit_problem
 
@@ -112,7 +112,7 @@ def fit_camera(
         problem.family,
         problem.evidence,
         tolerance=problem.tolerance,
-        model=FinerModel(problem.family, model),
+        model=partial(finer_matrix, problem.family, model),
         rounds=1 if model == "fresnel" else ROUNDS,
         progress=progress,
     )

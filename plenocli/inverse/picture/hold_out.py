@@ -10,11 +10,11 @@ divided out, and the block mean of the lenslet times white.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
+from plenocli.base.text import Record
 from plenocli.base.tiling import to_blocks, to_plane
 from plenocli.inverse.picture.estimators import root_mean_square
 from plenocli.inverse.picture.lenslet_model import LensletMatrix
@@ -29,7 +29,7 @@ Predict = Callable[[np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True, kw_only=True)
-class HeldOut:
+class HeldOut(Record):
     """Root mean square errors of predictions of pixels that were left out, in shares of the
     brightest pixel of white; the noise of these pixels is in all of them.
 
@@ -53,10 +53,6 @@ class HeldOut:
     neighbours: float
     neighbours_over_white: float
     block_mean: float
-
-    def as_json(self) -> dict[str, Any]:
-        """The fields by name."""
-        return asdict(self)
 
     @property
     def sentence(self) -> str:

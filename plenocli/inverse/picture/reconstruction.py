@@ -8,6 +8,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from plenocli.base.text import Record
 from plenocli.base.tiling import to_plane
 from plenocli.forward.sensor.noise import Noise
 from plenocli.inverse.picture.trust.noise_level import NoiseLevel
@@ -50,14 +51,10 @@ class Choice:
 
 
 @dataclass(frozen=True)
-class ContrastScale:
+class ContrastScale(Record):
     """The factor of the photographs' covariance that the whole capture was given."""
 
     scale: float
-
-    def as_json(self) -> dict[str, Any]:
-        """The field by name."""
-        return {"scale": self.scale}
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import os
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 from urllib.parse import quote
 
 from plenocli.base.errors import PlenoError
+from plenocli.base.text import Record
 
 if TYPE_CHECKING:
     from plenocli.files.results.run_folder import RunFile, RunFolder
@@ -31,7 +32,7 @@ MOST_VIEWS = 6
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReportSummary:
+class ReportSummary(Record):
     """What the page shows.
 
     files: read in the folder, of which `scores` are score documents.
@@ -46,10 +47,6 @@ class ReportSummary:
     scores: int
     sections: list[str]
     view: str | None
-
-    def as_json(self) -> dict[str, Any]:
-        """The summary of --json."""
-        return asdict(self)
 
 
 def run_report(

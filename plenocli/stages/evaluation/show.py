@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from plenocli.base.errors import InputError, UsageError
-from plenocli.base.text import by
+from plenocli.base.text import Record, by
 
 if TYPE_CHECKING:
     from plenocli.files.opened_file import OpenedFile
@@ -21,17 +21,13 @@ Place = tuple[int, int]
 
 
 @dataclass(frozen=True, kw_only=True)
-class ShowSummary:
+class ShowSummary(Record):
     """What was drawn: the picture, the files and what they are, and the captions in order."""
 
     output: str
     files: list[str]
     kinds: list[str]
     captions: list[str]
-
-    def as_json(self) -> dict[str, Any]:
-        """The summary of --json."""
-        return asdict(self)
 
 
 @dataclass(frozen=True, kw_only=True)

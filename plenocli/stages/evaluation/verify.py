@@ -5,16 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from plenocli.base.errors import InputError
+from plenocli.base.text import Record
 
 _FEW = 5
 """Names of a list that are told in one line."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Verified:
+class Verified(Record):
     """A file or folder that is as it was written.
 
     files: that were compared.
@@ -24,10 +24,6 @@ class Verified:
     path: Path
     files: int = 1
     signer: str | None = None
-
-    def as_json(self) -> dict[str, Any]:
-        """JSON-able."""
-        return {"path": str(self.path), "files": self.files, "signer": self.signer}
 
     def line(self) -> str:
         """In words."""

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from plenocli.base.errors import InputError, UsageError
-from plenocli.base.text import by
+from plenocli.base.text import Record, by
 
 if TYPE_CHECKING:
     from plenocli.evaluation.results import Result
@@ -20,7 +20,7 @@ VALUES = 1_500_000
 
 
 @dataclass(frozen=True, kw_only=True)
-class ViewSummary:
+class ViewSummary(Record):
     """What the page shows: files and what they are, titles of its panels, and its size."""
 
     output: str
@@ -28,10 +28,6 @@ class ViewSummary:
     kinds: list[str]
     panels: list[str]
     size_bytes: int
-
-    def as_json(self) -> dict[str, Any]:
-        """The summary of --json."""
-        return asdict(self)
 
 
 @dataclass(frozen=True, kw_only=True)

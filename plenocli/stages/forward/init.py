@@ -2,13 +2,13 @@
 
 import os
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 from pathlib import Path
-from typing import Any
 
 from plenocli.base.errors import InputError, OutputError
+from plenocli.base.text import Record
 
 RUNS_THE_CHAIN = "Makefile"
 
@@ -22,15 +22,11 @@ class Sample:
 
 
 @dataclass(frozen=True, kw_only=True)
-class InitSummary:
+class InitSummary(Record):
     """What was written: the folder and the names in it, the Makefile last."""
 
     folder: str
     files: list[str]
-
-    def as_json(self) -> dict[str, Any]:
-        """The summary for `--json`."""
-        return asdict(self)
 
 
 def run_init(folder: Path, *, overwrite: bool = False) -> InitSummary:

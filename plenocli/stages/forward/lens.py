@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from plenocli.base.errors import NumericsError
+from plenocli.base.text import Record
 from plenocli.base.units import format_length
 from plenocli.files.config.lens_file import lens_toml, load_lens
 from plenocli.files.config.prescription_file import import_lens
@@ -284,7 +285,7 @@ def _place(pupil: PupilSummary) -> str:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ImportSummary:
+class ImportSummary(Record):
     """What was imported.
 
     output: the lens file.
@@ -301,10 +302,6 @@ class ImportSummary:
     focal_length_m: float
     f_number: float | None
     notes: list[str]
-
-    def as_json(self) -> dict[str, Any]:
-        """The summary for `--json`."""
-        return asdict(self)
 
 
 def run_lens_import(

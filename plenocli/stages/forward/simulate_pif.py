@@ -12,6 +12,7 @@ import numpy as np
 
 from plenocli.base.errors import NumericsError, UsageError
 from plenocli.base.progress import bar, note
+from plenocli.base.text import Record
 
 if TYPE_CHECKING:
     from plenocli.files.artefacts.container import Artefact
@@ -166,7 +167,7 @@ class PifSummary:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PlanesSummary:
+class PlanesSummary(Record):
     """What was computed and written for a scene's depth.
 
     distances: of the planes, m;
@@ -177,15 +178,6 @@ class PlanesSummary:
     distances: tuple[float, ...]
     interpolation_error: float
     planes: list[PifSummary]
-
-    def as_json(self) -> dict[str, Any]:
-        """The fields by name."""
-        return {
-            "output": self.output,
-            "distances": list(self.distances),
-            "interpolation_error": self.interpolation_error,
-            "planes": [plane.as_json() for plane in self.planes],
-        }
 
     def line(self) -> str:
         """One sentence for people."""
@@ -200,7 +192,7 @@ class PlanesSummary:
 
 
 @dataclass(frozen=True, kw_only=True)
-class FieldSummary:
+class FieldSummary(Record):
     """What was computed and written for a whole array.
 
     nodes: places (rows, columns) of the field;
@@ -211,15 +203,6 @@ class FieldSummary:
     nodes: tuple[int, int]
     interpolation_error: float
     places: list[PifSummary]
-
-    def as_json(self) -> dict[str, Any]:
-        """The fields by name."""
-        return {
-            "output": self.output,
-            "nodes": list(self.nodes),
-            "interpolation_error": self.interpolation_error,
-            "places": [place.as_json() for place in self.places],
-        }
 
     def line(self) -> str:
         """One sentence for people."""

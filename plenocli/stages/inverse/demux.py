@@ -14,6 +14,7 @@ import numpy as np
 
 from plenocli.base.errors import InputError, NumericsError
 from plenocli.base.progress import note
+from plenocli.base.text import Record
 from plenocli.execution.batch import outcomes, plan_batch, summarise
 from plenocli.execution.pool import absolute, open_pool
 from plenocli.files.images.mosaic import read_capture
@@ -88,7 +89,7 @@ class CaptureSummary:
 
 
 @dataclass(frozen=True)
-class DemuxSummary:
+class DemuxSummary(Record):
     """What a run did.
 
     output: file or folder.
@@ -100,15 +101,6 @@ class DemuxSummary:
     done: int
     skipped: int
     captures: tuple[CaptureSummary, ...]
-
-    def as_json(self) -> dict[str, Any]:
-        """The summary as --json prints it."""
-        return {
-            "output": self.output,
-            "done": self.done,
-            "skipped": self.skipped,
-            "captures": [one.as_json() for one in self.captures],
-        }
 
 
 def run_demux(

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from plenocli.base.errors import UsageError
+from plenocli.base.text import Record
 from plenocli.execution.batch import outcomes, plan_batch, summarise
 from plenocli.execution.pool import open_pool
 
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RefocusSummary:
+class RefocusSummary(Record):
     """What refocus made.
 
     capture, output: files.
@@ -46,10 +47,6 @@ class RefocusSummary:
     sharpest_distance_m: float | None
     depth_known_share: float | None
     depth_beyond_share: float | None
-
-    def as_json(self) -> dict[str, Any]:
-        """The summary of --json."""
-        return asdict(self)
 
 
 @dataclass(frozen=True, kw_only=True)

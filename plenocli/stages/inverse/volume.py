@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from plenocli.base.progress import note
-from plenocli.base.text import by
+from plenocli.base.text import Record, by
 from plenocli.base.units import format_length
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ SUFFIXES = (".h5", ".tif", ".tiff")
 
 
 @dataclass(frozen=True, kw_only=True)
-class VolumeSummary:
+class VolumeSummary(Record):
     """What volume made.
 
     shape: planes, rows, columns.
@@ -41,10 +41,6 @@ class VolumeSummary:
     explained_db: float | None
     held_by_bars: list[float] | None
     margin: int
-
-    def as_json(self) -> dict[str, Any]:
-        """The summary of --json."""
-        return asdict(self)
 
     def line(self) -> str:
         """One sentence for people."""

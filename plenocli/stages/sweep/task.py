@@ -80,7 +80,7 @@ DESIGN = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class Task:
+class Task(Record):
     """One point, as everything that its figures depend on.
 
     chain: of CHAINS.
@@ -134,10 +134,6 @@ class Task:
         if picture:
             found["picture"] = {"scene": given.get("scene"), "target": None}
         return found
-
-    def as_json(self) -> dict[str, Any]:
-        """What the point is known by."""
-        return {"chain": self.chain, "camera": self.camera, "settings": self.settings}
 
 
 @dataclass(frozen=True, kw_only=True)

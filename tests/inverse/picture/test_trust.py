@@ -313,6 +313,40 @@ def test_a_pitch_that_is_off_breaks_the_picture_by_even_light_that_it_displaces(
     assert made("lmmse", pitch).as_json()["continuity"] < 0.6
 
 
+CIRCULAR = ('aperture_shape = "square"', 'aperture_shape = "circle"')
+FAST = ("f_number = 8", "f_number = 4.4")
+
+
+def coma(waves):
+    """Change of a camera's description."""
+    terms = "".join(
+        f'[[main_lens.aberrations]]\nnoll = {noll}\ncoefficient = "{550 * waves} nm"\n'
+        for noll in (7, 8)
+    )
+    return "[object]", f"{terms}\n[object]"
+
+
+def estimators_of(a):
+    system = replace(estimators().system, blocks=a[None])
+    return Estimators(system, Options(), lambda scene: pictures(), threads=1)
+
+
+@pytest.mark.parametrize("snr_db, seed", [(20, 0), (20, 1), (30, 3)])
+def test_an_error_of_a_fast_camera_is_no_veil(snr_db, seed):
+    """Even light is known to 5 % of the mean at 20 dB there, and found to be half of it."""
+    data = captured(matrix(FAST, coma(0.07)), snr_db, seed)
+    shared = estimators_of(matrix(FAST))
+    floor = psnr(made("block-mean", data, shared))
+    assert psnr(made("lmmse", data, shared)) > floor - 0.1
+
+
+def test_what_displaces_even_light_is_not_put_down_to_a_scene_that_jumps(monkeypatch):
+    data, shared = captured(matrix(CIRCULAR, coma(0.07)), 40), estimators_of(matrix(CIRCULAR))
+    monkeypatch.setattr(believe, "_scene_jumps", lambda *_: True)
+    told = made("lmmse", data, shared).as_json()
+    assert told["continuity"] < 0.5 and not told["matrix_believed"]
+
+
 @cache
 def dictionary():
     """Patches of the training pictures, as learn-dict starts from them."""

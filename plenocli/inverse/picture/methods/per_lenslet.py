@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from plenocli.base.progress import note
+from plenocli.base.text import Record
 from plenocli.inverse.picture import error_bars, footprint
 from plenocli.inverse.picture.estimators import Estimators
 from plenocli.inverse.picture.lenslet_model import Superpixels
@@ -43,27 +44,19 @@ Solve = Callable[
 
 
 @dataclass(frozen=True, kw_only=True)
-class TikhonovStats:
+class TikhonovStats(Record):
     """alpha: weight of |x|^2, in units of A's squared singular values; rule: how it was chosen."""
 
     alpha: float
     rule: str
 
-    def as_json(self) -> dict[str, Any]:
-        """The fields by name."""
-        return {"alpha": self.alpha, "rule": self.rule}
-
 
 @dataclass(frozen=True, kw_only=True)
-class TsvdStats:
+class TsvdStats(Record):
     """rank: directions kept; rule: how it was chosen."""
 
     rank: int
     rule: str
-
-    def as_json(self) -> dict[str, Any]:
-        """The fields by name."""
-        return {"rank": self.rank, "rule": self.rule}
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,6 +15,10 @@ from plenocli.inverse.picture.nuisances.pixel_model import PixelModel, chunks
 
 SURE = 4.0
 """Standard deviations from which on a veil is said to be there."""
+KNOWN = 0.03
+"""Share of the mean to which a veil must be known, noise alone: an error of the matrix passes for a
+bright one where it is not.
+"""
 EXPLAINED = 1.3
 """Noise found over noise expected, median of the lenslets, up to which the model explains a
 capture but for its veil.
@@ -139,7 +143,8 @@ def _common_veil(
         extra = _beyond_noise(value - np.median(value), variance)
         level, sigma = _mean(value, variance + extra)
         extra, sigma = 0.0 if unsure else extra, float(np.hypot(sigma, unsure))
-    removed = _possible(level, y, model.sigma) and (abs(level) > SURE * sigma or extra > 0)
+    known = _possible(level, y, model.sigma) and sigma < KNOWN * abs(float(np.mean(y)))
+    removed = known and (abs(level) > SURE * sigma or extra > 0)
     told_of = VeilFound(
         level=level,
         sigma=sigma,

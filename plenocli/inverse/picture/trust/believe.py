@@ -134,7 +134,7 @@ def believe(
     system, svd = estimators.system, estimators.svd
     moved = 0.0 if coupled else moved_rest(system, svd, lmmse, stacked, level.sigma)
     found = found or moved > SURE
-    quiet = beyond <= HINT * chance and moved <= HINT
+    quiet = beyond <= HINT * chance and moved <= HINT and not displaced
     least = None if first is None else first.most if quiet else first.relative
     continuous = least is None or least >= CONTINUOUS
     rough = (
@@ -285,13 +285,14 @@ def _scene_jumps(
 ) -> bool:
     """Whether the scene makes the jumps, and not the matrix, where nothing is found outside the
     range: there is room enough for it; the strongest coordinates jump as well; and the estimate is
-    one that a scene can have. y: (pixel, signal).
+    one that a scene can have. Where nothing stands above the noise it must be clearer.
+    y: (pixel, signal).
     """
     loud = np.count_nonzero(lmmse.power > lmmse.sigma**2)
     return (
         level.found is not None
         and bool(dark(svd) >= ROOM * loud)
-        and verdict.most < JUMPS
+        and verdict.most < (JUMPS if loud else JUMPS / 2)
         and verdict.strongest.most < STRONGEST_JUMP
         and not spoilt_by_matrix(lmmse, y)
     )

@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 from pydantic import Field, TypeAdapter, ValidationError
 
+from plenocli.base.text import Record
+
 if TYPE_CHECKING:
     from plenocli.base.errors import PlenoError
     from plenocli.forward.camera.microscope import Microscope

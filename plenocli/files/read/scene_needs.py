@@ -11,6 +11,7 @@ import numpy as np
 from plenocli.files.read.scenes import read_scene
 from plenocli.forward.accuracy.scene_needs import SceneNeeds
 from plenocli.forward.scene.scenes import Cube
+from plenocli.forward.scene.tables import illuminant
 
 if TYPE_CHECKING:
     from plenocli.forward.camera.model import Camera
@@ -36,7 +37,8 @@ def read_needs(name: str | Path, camera: Camera) -> SceneNeeds:
     )
     return SceneNeeds(
         depth=scene.depth,
-        spectrum=found.spectrum if scene.spectrum is None else scene.spectrum,
+        spectrum=scene.spectrum,
+        light=found.light,
         lenslets=found.lenslets if scene.lenslets is None else scene.lenslets,
         noise=None if scene.snr is None else 10 ** (-scene.snr / 20),
         source=Path(name).name,
@@ -44,7 +46,9 @@ def read_needs(name: str | Path, camera: Camera) -> SceneNeeds:
 
 
 def _from_picture(name: str | Path, camera: Camera) -> SceneNeeds:
-    """Extent in lenslets and, of a spectral picture, the wavelengths between which it has light."""
+    """Extent in lenslets and, of a spectral picture, its light at each of its bands under the
+    camera's lamp.
+    """
     scene = read_scene(str(name), spectral=True)
     count = camera.lenslet_array.count
     wavelengths = scene.wavelengths if isinstance(scene, Cube) else camera.light.wavelengths
@@ -64,8 +68,9 @@ def _from_picture(name: str | Path, camera: Camera) -> SceneNeeds:
     rows, columns = (np.flatnonzero(lit.any(axis=axis)) for axis in (1, 0))
     found = SceneNeeds(lenslets=(int(rows[-1] - rows[0] + 1), int(columns[-1] - columns[0] + 1)))
     if isinstance(scene, Cube):
-        with_light = np.asarray(wavelengths)[planes.max(axis=(1, 2)) > DARK * peak]
-        step = np.diff(wavelengths).max() / 2 if len(wavelengths) > 1 else 0.0
-        ends = (float(with_light[0] - step), float(with_light[-1] + step))
-        found = replace(found, spectrum=ends)
+        light = [
+            float(np.sqrt(np.square(plane).mean())) * illuminant(camera.light.illuminant, float(w))
+            for w, plane in zip(wavelengths, planes)
+        ]
+        found = replace(found, light=(tuple(map(float, wavelengths)), tuple(light)))
     return found

@@ -159,10 +159,14 @@ class _Request:
         self.reasons: list[str] = []
         self.left_out: list[str] = []
         self.warnings: list[str] = []
-        kept, dropped = seen_wavelengths(wavelengths or camera.light.wavelengths, needs)
-        if dropped:
+        self.explicit = accuracy is not None
+        self.accuracy, self.asked_by = self._accuracy(accuracy)
+        every = wavelengths or camera.light.wavelengths
+        kept, self.dim = seen_wavelengths(every, needs, self.accuracy)
+        if len(kept) < len(every):
             self.left_out.append(
-                f"{len(dropped)} wavelength(s) without light in the scene: no error"
+                f"{len(every) - len(kept)} of {len(every)} wavelength(s) with little or no light "
+                f"in the scene: {f'error up to {self.dim:.1g}' if self.dim else 'no error'}"
             )
         self.pixel_shift, self.chief = _place(camera, lenslet)
         self.chief = chief or self.chief
@@ -183,8 +187,6 @@ class _Request:
             if camera.light.band is not None and kept == (camera.light.band.center,)
             else None
         )
-        self.explicit = accuracy is not None
-        self.accuracy, self.asked_by = self._accuracy(accuracy)
         self.dtype = np.dtype(
             (np.float32 if self.accuracy >= 1e-6 else np.float64)
             if isinstance(dtype, str) and dtype == "auto"
@@ -288,7 +290,7 @@ def _consider(request: _Request, model: Model) -> Candidate:
         # the rings that a user asks for are the user's model
         nodes, spectrum = _band_nodes(request, model, ring)
         split = fixed | {
-            "spectrum": spectrum,
+            "spectrum": math.hypot(spectrum, request.dim),
             "neighbourhood": outside if len(request.rings) > 1 else 0.0,
         }
         tried.append(_sized(request, model, ring, split, nodes))

@@ -8,6 +8,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from plenocli.forward.sensor.detector import SensorModel
 
 if TYPE_CHECKING:
@@ -18,6 +20,9 @@ HIDDEN = 0.3
 total: it cannot be seen.
 """
 
+DIM = 0.1
+"""Share of an accuracy that wavelengths of little light may be left out for."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class SceneNeeds:
@@ -25,6 +30,8 @@ class SceneNeeds:
 
     depth: nearest and farthest distance (m) to the main lens, for depth_planes;
     spectrum: lowest and highest wavelength (m) with light;
+    light: (wavelengths in m, root mean square of the scene's light at each, in any unit), linear
+        between them and constant beyond;
     lenslets: (rows, columns) that see light;
     noise: relative noise of a pixel at the brightest;
     source: who says so.
@@ -32,6 +39,7 @@ class SceneNeeds:
 
     depth: tuple | None = None
     spectrum: tuple | None = None
+    light: tuple | None = None
     lenslets: tuple | None = None
     noise: float | None = None
     source: str = "scene"
@@ -55,19 +63,28 @@ def visible_accuracy(noise: float) -> float:
 
 
 def seen_wavelengths(
-    wavelengths: Sequence[float], needs: SceneNeeds | None
-) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Part wavelengths into those that the scene has light at and others.
+    wavelengths: Sequence[float], needs: SceneNeeds | None, accuracy: float
+) -> tuple[tuple[float, ...], float]:
+    """The wavelengths that the scene has light at.
 
     wavelengths: m;
-    needs: what is known of the scene, None for nothing.
+    needs: what is known of the scene, None for nothing;
+    accuracy: of the scene's image, of which the dimmest ones may take DIM together.
 
-    Returns (kept, left out); all are kept where else none would be.
+    Returns (those kept, light of the others over that of the brightest: the most that a picture of
+    all loses without them); all are kept where else none would be.
     """
-    if needs is None or needs.spectrum is None:
-        return tuple(wavelengths), ()
-    low, high = needs.spectrum
-    kept = tuple(w for w in wavelengths if low * (1 - 1e-9) <= w <= high * (1 + 1e-9))
-    return (
-        (kept, tuple(w for w in wavelengths if w not in kept)) if kept else (tuple(wavelengths), ())
-    )
+    every = np.asarray(wavelengths, float)
+    light = np.ones(len(every))
+    if needs is not None and needs.light is not None:
+        light = np.interp(every, *needs.light)
+    if needs is not None and needs.spectrum is not None:
+        low, high = needs.spectrum
+        light = light * ((low * (1 - 1e-9) <= every) & (every <= high * (1 + 1e-9)))
+    if not light.max() > 0:
+        return tuple(wavelengths), 0.0
+    order = np.argsort(light, kind="stable")
+    lost = np.cumsum(light[order]) / light.max()
+    count = int((lost <= DIM * accuracy).sum())
+    kept = np.sort(order[count:])
+    return tuple(wavelengths[n] for n in kept), float(lost[count - 1]) if count else 0.0

@@ -184,7 +184,7 @@ def test_a_scene_narrows_the_model(ladder):
         camera, accuracy=1e-2, needs=SceneNeeds(spectrum=(500e-9, 700e-9), lenslets=(1, 2))
     )
     assert [b.wavelength for b in plan.bands] == [550e-9, 650e-9]
-    assert any("1 wavelength" in text for text in plan.left_out) and any(
+    assert any("1 of 3 wavelength" in text for text in plan.left_out) and any(
         "7 of 9 lenslets" in text for text in plan.left_out
     )
     # depth is a matter of several plans, each with the neighbourhood of its own distance
@@ -192,6 +192,14 @@ def test_a_scene_narrows_the_model(ladder):
         plan_pif(camera, accuracy=1e-2, needs=SceneNeeds(depth=(0.45, 0.55))).superpixels
         == plan_pif(camera, accuracy=1e-2).superpixels
     )
+    # what has light only between two of the camera's wavelengths has some at both
+    lamp = SceneNeeds(light=((430e-9, 480e-9, 520e-9, 800e-9), (0.0, 1.0, 0.0, 0.0)))
+    assert [
+        b.wavelength
+        for b in plan_pif(
+            small_camera(light__wavelengths=(450e-9, 500e-9, 550e-9)), accuracy=1e-2, needs=lamp
+        ).bands
+    ] == [450e-9, 500e-9]
     # light outside the camera's wavelengths changes nothing
     assert (
         len(plan_pif(camera, accuracy=1e-2, needs=SceneNeeds(spectrum=(900e-9, 1e-6))).bands) == 3

@@ -86,7 +86,7 @@ def error_over_asked(camera, pixels, accuracy, **request):
         (112, 7, 0, "circle", 3, 1, 1e-2),
         (57, 3, 5, "circle", 7, 0, 1e-3),
         (20, 1, 1, "square", 3, 0, 1e-3),
-        (13, 1, 3, "square", 5, 0, 1e-1),
+        (13, 1, 3, "square", 5, 0, 1e-2),
         (34, 20, 3, "circle", 5, 0, 1e-4),
     ],
 )
@@ -99,7 +99,7 @@ def test_pixels_of_many_fringes_hold(cells, pixels, blur, pupil, superpixels, ri
         superpixels=(superpixels, superpixels),
         coherent_ring=ring,
     )
-    assert 1e-5 < found < 1
+    assert 1e-3 < found < 1
 
 
 @pytest.mark.parametrize("cameras", [40, pytest.param(600, marks=pytest.mark.slow)])

@@ -41,6 +41,11 @@ class DepthPlanes:
     distances: tuple[float, ...]
     depth: tuple[float, float]
     error: float
+    kind = "planes"
+
+    def as_json(self) -> dict[str, list[float]]:
+        """Where they are."""
+        return {"distances": list(self.distances)}
 
     def line(self) -> str:
         """One sentence for people."""

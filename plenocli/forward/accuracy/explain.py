@@ -5,18 +5,17 @@ what each would cost.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from plenocli.base.text import Record
 from plenocli.forward.accuracy.dial import seconds_here
 from plenocli.forward.propagation.costs import law
 from plenocli.forward.propagation.diagnosis import seconds as diagnosis_seconds
 
 if TYPE_CHECKING:
     from plenocli.forward.camera.model import Camera
-    from plenocli.forward.propagation.plan import PifPlan
+    from plenocli.forward.propagation.plan import Candidate, PifPlan
 
 ENDS = 5
 """Planes told at either end of a long list."""
@@ -90,7 +89,7 @@ def explain(plan: PifPlan, memory: int | None = None, took: CommandSeconds | Non
             f"{plan.coherent_ring}"
         ),
         "",
-        *_table(candidates(plan)),
+        *_table(plan.candidates),
         "",
         *(
             []
@@ -127,29 +126,6 @@ def explain(plan: PifPlan, memory: int | None = None, took: CommandSeconds | Non
 
 
 @dataclass(frozen=True, kw_only=True)
-class Considered(Record):
-    """A model that a plan considered; None where nothing is known, since it does not serve.
-
-    rung: its name;
-    model: its kind, "ray", "fresnel" or "exact";
-    reason: why it was not chosen;
-    error: relative L2 of the worst column, of which `split` names the parts by source;
-    seconds: of one core of this machine;
-    bytes: of result and work.
-    """
-
-    rung: str
-    model: str
-    chosen: bool
-    reason: str | None
-    error: float | None
-    split: Mapping[str, float] | None
-    coherent_ring: int | None
-    seconds: float | None
-    bytes: int | None
-
-
-@dataclass(frozen=True, kw_only=True)
 class PlaneCost:
     """One plane of a scene's depth.
 
@@ -179,25 +155,18 @@ def planes_table(planes: list[PlaneCost]) -> list[str]:
     return [*lines, f"in all {_duration(seconds)}, {_size(size)}"]
 
 
-def candidates(plan: PifPlan) -> list[Considered]:
-    """The models that a plan considered, coarse to fine."""
-    found = []
-    for c in plan.candidates:
-        known = c.split is not None
-        found.append(
-            Considered(
-                rung=c.name,
-                model=c.model,
-                chosen=c.why is None,
-                reason=c.why,
-                error=c.error if known else None,
-                split=c.split,
-                coherent_ring=c.ring if known else None,
-                seconds=seconds_here(c) if known else None,
-                bytes=c.bytes if known else None,
-            )
-        )
-    return found
+def considered(plan: PifPlan) -> list[dict[str, Any]]:
+    """The models that a plan considered, coarse to fine, as JSON has them: name, kind, whether and
+    why not chosen; error by source, rings, seconds of one core of this machine, bytes at work, None
+    where a model does not serve.
+    """
+    return [
+        {"rung": c.name, "model": c.model, "chosen": c.why is None, "reason": c.why}
+        | {"error": known and c.error, "split": c.split, "coherent_ring": known and c.ring}
+        | {"seconds": known and seconds_here(c), "bytes": known and c.bytes}
+        for c in plan.candidates
+        for known in (None if c.split is None else True,)
+    ]
 
 
 def expectation(
@@ -236,13 +205,13 @@ def expectation(
     )
 
 
-def _table(rows: list[Considered]) -> list[str]:
+def _table(rows: Sequence[Candidate]) -> list[str]:
     cells = [("rung", "error", "time", "memory", "")]
-    for r in rows:
+    for c in rows:
         numbers = ("-", "-", "-")
-        if r.error is not None and r.seconds is not None and r.bytes is not None:
-            numbers = (f"{r.error:.1g}", _duration(r.seconds), _size(r.bytes))
-        cells.append((r.rung, *numbers, "chosen" if r.reason is None else r.reason))
+        if c.split is not None:
+            numbers = (f"{c.error:.1g}", _duration(seconds_here(c)), _size(c.bytes))
+        cells.append((c.name, *numbers, "chosen" if c.why is None else c.why))
     widths = [max(len(row[i]) for row in cells) for i in range(4)]
     return [
         "  ".join(

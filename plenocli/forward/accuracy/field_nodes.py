@@ -47,6 +47,11 @@ class FieldNodes:
     file: np.ndarray
     turn: np.ndarray
     error: float = math.nan
+    kind = "places"
+
+    def as_json(self) -> dict[str, list[int]]:
+        """How many there are along rows and columns."""
+        return {"nodes": [len(self.rows), len(self.columns)]}
 
     @property
     def places(self) -> list[Place]:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from plenocli.files.artefacts.container import Artefact
     from plenocli.files.artefacts.provenance import Provenance
     from plenocli.forward.accuracy.depth_planes import DepthPlanes
-    from plenocli.forward.accuracy.explain import Considered, PlaneCost
+    from plenocli.forward.accuracy.explain import PlaneCost
     from plenocli.forward.accuracy.field_nodes import FieldNodes
     from plenocli.forward.accuracy.scene_needs import SceneNeeds
     from plenocli.forward.camera.model import Camera
@@ -65,7 +65,7 @@ class Settings:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PlanSummary:
+class PlanSummary(Record):
     """What --explain tells; no matrix was computed.
 
     plan: several lines of text;
@@ -79,21 +79,13 @@ class PlanSummary:
     plan: str
     memory: int
     accuracy: AccuracyRecord
-    considered: list[Considered]
+    considered: list[dict[str, Any]]
     seconds: float
     bytes: int
     superpixels: tuple[int, int]
     coherent_ring: int
     estimated_accuracy: float
     planes: list[PlaneCost] = field(default_factory=list)
-
-    def as_json(self) -> dict[str, Any]:
-        """The fields by name."""
-        return _named(self) | {
-            "accuracy": self.accuracy.as_json(),
-            "considered": [c.as_json() for c in self.considered],
-            "planes": [asdict(p) for p in self.planes],
-        }
 
     def line(self) -> str:
         """What people read."""
@@ -144,7 +136,7 @@ class PifSummary:
             "energy_min": found.energy_min,
             "energy_max": found.energy_max,
         }
-        report = _named(self)
+        report = {field.name: getattr(self, field.name) for field in fields(self)}
         del report["diagnosis"]
         return report | {name: value for name, value in known.items() if value is not None}
 
@@ -167,50 +159,32 @@ class PifSummary:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PlanesSummary(Record):
-    """What was computed and written for a scene's depth.
+class SeveralSummary:
+    """What was computed and written for a scene's depth or for a whole array.
 
-    distances: of the planes, m;
-    interpolation_error: relative, of the worst column in between.
+    several: its planes, or the places of the field;
+    made: the matrix of each.
     """
 
     output: str
-    distances: tuple[float, ...]
-    interpolation_error: float
-    planes: list[PifSummary]
+    several: DepthPlanes | FieldNodes
+    made: list[PifSummary]
+
+    def as_json(self) -> dict[str, Any]:
+        """The fields by name."""
+        return {
+            "output": self.output,
+            **self.several.as_json(),
+            "interpolation_error": self.several.error,
+            self.several.kind: [one.as_json() for one in self.made],
+        }
 
     def line(self) -> str:
         """One sentence for people."""
-        sizes = [plane.superpixels[0] for plane in self.planes]
+        error = max(one.estimated_accuracy for one in self.made)
         return (
-            f"{Path(self.output)}: A of {len(self.planes)} planes from {self.distances[0]:.4g} to "
-            f"{self.distances[-1]:.4g} m, each in a file beside it, of {min(sizes)}x{min(sizes)} "
-            f"to {max(sizes)}x{max(sizes)} superpixels; estimated error "
-            f"{max(plane.estimated_accuracy for plane in self.planes):.1g}, interpolation between "
-            f"planes ({self.interpolation_error:.1g}) included"
-        )
-
-
-@dataclass(frozen=True, kw_only=True)
-class FieldSummary(Record):
-    """What was computed and written for a whole array.
-
-    nodes: places (rows, columns) of the field;
-    interpolation_error: relative, of the worst column in between.
-    """
-
-    output: str
-    nodes: tuple[int, int]
-    interpolation_error: float
-    places: list[PifSummary]
-
-    def line(self) -> str:
-        """One sentence for people."""
-        return (
-            f"{Path(self.output)}: A of {self.nodes[0]}x{self.nodes[1]} places of the field, in "
-            f"{len(self.places)} files beside it; estimated error "
-            f"{max(place.estimated_accuracy for place in self.places):.1g}, interpolation between "
-            f"places ({self.interpolation_error:.1g}) included"
+            f"{Path(self.output)}: A in {len(self.made)} files beside it; {self.several.line()}; "
+            f"estimated error {error:.1g}, that included"
         )
 
 
@@ -230,10 +204,6 @@ def _condition(found: Diagnosis, dtype: str) -> str:
     )
 
 
-def _named(summary: PlanSummary | PifSummary) -> dict[str, Any]:
-    return {field.name: getattr(summary, field.name) for field in fields(summary)}
-
-
 def run_simulate_pif(
     camera_path: Path | str,
     output: Path | str | None,
@@ -243,7 +213,7 @@ def run_simulate_pif(
     overwrite: bool = False,
     workers: int = 1,
     command: str = "",
-) -> PifSummary | PlanesSummary | FieldSummary | PlanSummary | StackSummary:
+) -> PifSummary | SeveralSummary | PlanSummary | StackSummary:
     """Compute A and write it as a pif artefact; of a scene with depth one a plane, of a whole array
     one a place of the field, and an index; of a microscope the kernels of its volume.
 
@@ -453,7 +423,7 @@ def _write(task: _Task, job: _Job, output: Path | str) -> PifSummary:
 
 def _write_several(
     task: _Task, jobs: list[_Job], several: DepthPlanes | FieldNodes, output: Path | str
-) -> PlanesSummary | FieldSummary:
+) -> SeveralSummary:
     """Compute the matrices of all planes or places into files of their own, then the index; all
     appear together.
     """
@@ -478,19 +448,7 @@ def _write_several(
             write_planes(
                 output, several.distances, several.error, provenance, overwrite=task.overwrite
             )
-    if isinstance(several, FieldNodes):
-        return FieldSummary(
-            output=str(output),
-            nodes=(len(several.rows), len(several.columns)),
-            interpolation_error=several.error,
-            places=made,
-        )
-    return PlanesSummary(
-        output=str(output),
-        distances=several.distances,
-        interpolation_error=several.error,
-        planes=made,
-    )
+    return SeveralSummary(output=str(output), several=several, made=made)
 
 
 def _require_output(camera_path: Path | str, output: Path | str | None, overwrite: bool) -> None:
@@ -563,8 +521,8 @@ def _explained(
     from plenocli.files.artefacts import pif_pieces
     from plenocli.forward.accuracy.explain import (
         PlaneCost,
-        candidates,
         command_seconds,
+        considered,
         explain,
         planes_table,
     )
@@ -594,7 +552,7 @@ def _explained(
         plan=text,
         memory=max(cost.memory for cost in costs),
         accuracy=plan.accuracy_record(),
-        considered=candidates(plan),
+        considered=considered(plan),
         seconds=took[0].start + sum(cost.seconds for cost in costs),
         bytes=sum(cost.bytes for cost in costs),
         superpixels=plan.superpixels,

@@ -11,7 +11,7 @@ import pytest
 from plenocli.base.errors import NumericsError, UsageError
 from plenocli.forward.accuracy import dial
 from plenocli.forward.accuracy.dial import plan_pif
-from plenocli.forward.accuracy.explain import _duration, candidates, expectation, explain
+from plenocli.forward.accuracy.explain import _duration, considered, expectation, explain
 from plenocli.forward.accuracy.scene_needs import SceneNeeds, sensor_noise
 from plenocli.forward.propagation.costs import Cost
 from plenocli.forward.propagation.sampling import size_band
@@ -72,15 +72,16 @@ def test_the_cheapest_model_that_serves_is_taken(ladder, accuracy, chosen):
     plan = plan_pif(small_camera(), accuracy=accuracy)
     assert plan.rung == chosen and plan.estimated <= accuracy
     assert math.hypot(*plan.split.values()) == pytest.approx(plan.estimated)
-    table = {c.rung: c for c in candidates(plan)}
-    assert [name for name, c in table.items() if c.chosen] == [chosen]
+    table = {c["rung"]: c for c in considered(plan)}
+    assert [name for name, c in table.items() if c["chosen"]] == [chosen]
     for name, error in (("coarse", 0.1), ("middle", 1e-3), ("fine", 0.0)):
-        assert table[name].split["model"] == error
+        assert table[name]["split"]["model"] == error
         if error > accuracy:
-            assert "model error" in table[name].reason
+            assert "model error" in table[name]["reason"]
     if accuracy == 0.2:
         assert (
-            "10 times the cost" in table["middle"].reason and "1e+02 times" in table["fine"].reason
+            "10 times the cost" in table["middle"]["reason"]
+            and "1e+02 times" in table["fine"]["reason"]
         )
     text = explain(plan)
     assert all(name in text for name in table) and "chosen" in text and "error by source" in text

@@ -143,7 +143,7 @@ def _common_veil(
         extra = _beyond_noise(value - np.median(value), variance)
         level, sigma = _mean(value, variance + extra)
         extra, sigma = 0.0 if unsure else extra, float(np.hypot(sigma, unsure))
-    known = _possible(level, y, model.sigma) and sigma < KNOWN * abs(float(np.mean(y)))
+    known = _possible(level, y, model.sigma) and sigma < KNOWN * abs(float(np.mean(y)) - level)
     removed = known and (abs(level) > SURE * sigma or extra > 0)
     told_of = VeilFound(
         level=level,

@@ -51,6 +51,10 @@ SURE, HINT = 4.0, 2.5
 moved, speaks against the matrix by itself, and from which on beside a picture that may not go on
 across borders.
 """
+JUMPING = 6.0
+"""Standard deviations of even light that moved, up to which jumps may be the scene's: five stars
+before a right matrix have 4.6.
+"""
 CHANCE = 1.0
 """Standard deviations of chance that a factor is allowed where nothing else is found, and that are
 taken off where the matrix is not believed.
@@ -120,7 +124,8 @@ def believe(
     lmmse = estimators.prior.lmmse(level.sigma, scene)
     stacked = y.reshape(-1, y.shape[-1]).T
     judge = _Judge.of(estimators, lmmse, y, scene)
-    shown, displaced = (None, 0.0) if coupled else _displaced(judge, estimators, lmmse, stacked)
+    shown, even = (None, 0.0) if coupled else _displaced(judge, estimators, lmmse, stacked)
+    displaced = 0.0 if shown is None else even
     if judge is not None and shown is not None:
         y = without_pattern(lmmse, y, shown)
         stacked, judge = y.reshape(-1, y.shape[-1]).T, replace(judge, y=y)
@@ -141,6 +146,7 @@ def believe(
         first is not None
         and not continuous
         and quiet
+        and even <= JUMPING
         and _scene_jumps(svd, lmmse, stacked, level, first)
     )
     if not found and (continuous or rough):
@@ -273,10 +279,10 @@ class _Judge:
 def _displaced(
     judge: _Judge | None, estimators: Estimators, lmmse: Lmmse, y: np.ndarray
 ) -> tuple[np.ndarray | None, float]:
-    """Even light that moved and is no part of a continuous scene, as `moved_even_light`."""
+    """Even light that moved, as `moved_even_light`; None where it may be a continuous scene's."""
     shown, deviations = moved_even_light(estimators.system, lmmse, y)
     if judge is None or deviations <= SURE or judge.goes_on(lmmse, shown) >= CONTINUOUS:
-        return None, 0.0
+        return None, deviations
     return shown, deviations
 
 

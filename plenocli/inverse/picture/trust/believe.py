@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from plenocli.base.random_streams import stream
-from plenocli.inverse.picture.estimators import Estimators
+from plenocli.inverse.picture.estimators import Estimators, root_mean_square
 from plenocli.inverse.picture.solvers.least_squares import Svd
 from plenocli.inverse.picture.solvers.lmmse import Lmmse
 from plenocli.inverse.picture.trust.continuity import (
@@ -130,12 +130,11 @@ def believe(
         y = without_pattern(lmmse, y, shown)
         stacked, judge = y.reshape(-1, y.shape[-1]).T, replace(judge, y=y)
     first = None if judge is None else judge.of_lmmse(lmmse)
-    loud = float(np.sqrt(np.mean(y**2)))
     beyond = (
         -np.inf if level.found is None else level.found / level.sigma - (MISFIT if coupled else 1)
     )
     chance = 1 / np.sqrt(2 * max(dark(estimators.svd) * stacked.shape[1], 1))
-    found = beyond > MISTOLD + SURE * chance or model_error * loud > level.sigma
+    found = beyond > MISTOLD + SURE * chance or model_error * root_mean_square(y) > level.sigma
     system, svd = estimators.system, estimators.svd
     moved = 0.0 if coupled else moved_rest(system, svd, lmmse, stacked, level.sigma)
     found = found or moved > SURE

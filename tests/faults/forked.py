@@ -7,6 +7,7 @@ As a program (`forked.py SOCKET`) it serves; `Forks` is the tests' side; SHIM st
 
 import asyncio
 import contextlib
+import ctypes
 import importlib
 import json
 import os
@@ -199,6 +200,8 @@ def main(address):
 
 def _serve(connection, logs):
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # with the server, and so with the tests
     what, arguments, cwd, group = json.loads(connection.makefile("rb").readline())
     os.setpgid(0, group)
     if group and select.select([connection], [], [], 0)[0]:

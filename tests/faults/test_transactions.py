@@ -37,7 +37,10 @@ SEVERAL = {
         "capture-sim camera.toml --pif pif.h5 --scene photo.png -o out/q.h5 --scene-out out/s.h5"
     ),
     "score": "score image.h5 --truth capture.h5 -o out/s.json --report out/s.html",
-    "folders": "score image.h5 --truth capture.h5 -o out/x/s.json --report out/y/s.html",
+    "folders": (
+        "capture-sim camera.toml --pif pif.h5 --scene photo.png -o out/x/q.h5 "
+        "--scene-out out/y/s.h5"
+    ),
     "sweep": "sweep designs.toml -o out/w.h5",
     "planes": (
         "simulate-pif camera.toml --scene near.toml --accuracy 0.05 --superpixels 1x1 "

@@ -66,7 +66,7 @@ from plenocli.inverse.prior.natural_images import TrainingPicture, at_scales, sp
 from plenocli.inverse.sparse import dictionary as sparse
 from plenocli.inverse.sparse.dictionary import INCOHERENCE, PULL, Dictionary
 from plenocli.inverse.sparse.learning import advance, learner_for
-from plenocli.inverse.spectra.demultiplexer import Demultiplexer, method_of_white
+from plenocli.inverse.spectra.demultiplexer import Demultiplexer, method_of_white, tell_misfit
 from plenocli.inverse.spectra.polarisation import stokes
 from plenocli.inverse.spectra.spectra import Spectra
 
@@ -321,8 +321,10 @@ def demultiplex(
         )
         found = solver.estimate(_capture(capture), "capture")
         if white is None:
+            tell_misfit({"capture": found})
             return stokes(found)
         reference = solver.estimate(_capture(white), "white", method_of_white(method))
+        tell_misfit({"capture": found, "white": reference})
         return stokes(found.relative_to(reference, reflectance))
 
 

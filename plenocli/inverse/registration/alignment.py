@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from plenocli.base.errors import NumericsError
-from plenocli.base.progress import note
 from plenocli.inverse.calibration.calibration import there
 
 if TYPE_CHECKING:
@@ -239,16 +238,11 @@ def believed(residual: np.ndarray | None, plain: np.ndarray | None) -> bool:
     return misfit(residual) - 1 <= BELIEVED * (misfit(plain) - 1)
 
 
-def warn_of_misfit(
-    residual: np.ndarray | None, registration: Registration | None, path: str | Path
-) -> str | None:
-    """Warn where the calibration does not describe the capture.
+def misfit_told(residual: np.ndarray | None, registration: Registration | None) -> str | None:
+    """The sentence where the calibration does not describe the capture, else None.
 
     residual: (lenslet_row, lenslet_column), of its mean square over the expected one.
     registration: what was found between the two.
-    path: of the capture, for the message.
-
-    Returns the sentence, or None.
     """
     middle = misfit(residual)
     if middle <= POOR_FIT:
@@ -258,12 +252,11 @@ def warn_of_misfit(
         if registration is None
         else "after registration"
         if registration.corrected
-        else "and no motion explains it"
+        else "no motion explains it"
     )
-    text = (
-        f"the calibration does not describe this capture: residuals have {middle:.3g} times the "
-        f"power of the noise ({tried}). Predicted errors are too small; filters, leak between "
-        "bands, focus or the scene within a lenslet's field may differ: calibrate again"
+    return (
+        f"residuals have {middle:.3g} times the power of the noise ({tried}), so that stated "
+        "errors are too small. Broad light where bands were calibrated narrow does so, most of "
+        "which divides out with --reference; so do another focus, a leak, edges within lenslets' "
+        "fields: calibrate again"
     )
-    note(f"warning: {path}: {text}")
-    return text

@@ -51,6 +51,7 @@ class Motion:
     stray: light that the calibration does not know, spread over superpixels, in shares of their
         mean light; below zero by no more than the calibration's darkest pixel has.
     sigma: (3,), standard deviations of row shift, column shift and offset.
+    beyond_chance: of the whole displacement, in standard deviations.
     stray_sigma: of `stray`, NaN where all lenslets are alike.
     before, after: mean square of the residual over the expected one, median over the lenslets used,
         without and with the motion.
@@ -64,6 +65,7 @@ class Motion:
     offset: float
     stray: float
     sigma: np.ndarray
+    beyond_chance: float
     stray_sigma: float
     before: float
     after: float
@@ -87,8 +89,7 @@ class Motion:
         than can be followed.
         """
         return bool(
-            self.reach < REACH + 2
-            and self.reach > max(LEAST_SHIFT, SIGNIFICANT * np.hypot(*self.sigma[:2]))
+            self.reach < REACH + 2 and self.reach > LEAST_SHIFT and self.beyond_chance > SIGNIFICANT
         )
 
     @property
@@ -256,6 +257,7 @@ class _LensletSample:
             offset=float(solved[-2]),
             stray=float(solved[-1]),
             sigma=sigma,
+            beyond_chance=_beyond_chance(normal / scale**2, q.ravel()),
             stray_sigma=float(spread[-1] * scale),
             before=float(np.median(before)),
             after=float(np.median(after)),
@@ -354,6 +356,18 @@ def _chi_after(product: np.ndarray, chi: np.ndarray, step: np.ndarray) -> np.nda
         - (step[:, None] @ product[:, :2, :2] @ step[..., None])[:, 0, 0]
     )
     return chi * (1 - gain / np.maximum(product[:, 4, 4], 1e-300))
+
+
+def _beyond_chance(normal: np.ndarray, q: np.ndarray) -> float:
+    """Standard deviations by which displacement coefficients q are more than chance: their squared
+    distance from none is chi^2 of as many degrees of freedom if they are (R. A. Fisher's root).
+
+    normal: of q and of what else was fitted.
+    """
+    n = len(q)
+    others = np.linalg.pinv(normal[n:, n:], hermitian=True)
+    told = normal[:n, :n] - normal[:n, n:] @ others @ normal[n:, :n]
+    return float(np.sqrt(2 * max(q @ told @ q, 0.0)) - np.sqrt(2 * n - 1))
 
 
 def _solve(

@@ -28,7 +28,7 @@ MOST = 2.0
 TURNS = 3
 KNOWN_TO = 0.035
 """Share of what neighbours' light changes, over the array, by which the change may be wrong."""
-FINER = 2.2
+FINER = 1.8
 """By which more points than three a side would change the answers of a lenslet and those about it
 (rms) less than three instead of one did: edges between points.
 """

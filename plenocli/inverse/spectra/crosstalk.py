@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from plenocli.base.errors import NumericsError
+from plenocli.inverse.registration.motion import SIGNIFICANT
 from plenocli.inverse.spectra.coupled import (
     LatticeAnswer,
     LatticeCapture,
@@ -79,6 +80,14 @@ class Crosstalk:
     def shift_step(self, moving: MovingResponse, shift: np.ndarray) -> np.ndarray:
         """By how much (2,) px the superpixels lie elsewhere than at `shift`."""
         return shift_step(self.capture, self.first, np.nan_to_num(moving.slopes(shift)))
+
+    def explains_more_than(self, other: Crosstalk) -> bool:
+        """Whether it leaves less of the lenslets than another look at the same capture, by more
+        than they scatter.
+        """
+        gain = other.first.residual - self.first.residual
+        gain = gain[np.isfinite(gain)]
+        return len(gain) > 0 and bool(gain.mean() > SIGNIFICANT * gain.std() / np.sqrt(len(gain)))
 
     def freed(self) -> np.ndarray:
         """The values as if every lenslet's neighbours were like itself."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,7 +11,7 @@ import numpy as np
 
 from plenocli.base.errors import ConfigError, NumericsError, UsageError
 from plenocli.base.progress import note
-from plenocli.inverse.registration.alignment import align, believed, doubtful, warn_of_misfit
+from plenocli.inverse.registration.alignment import align, believed, doubtful, misfit_told
 from plenocli.inverse.spectra.crosstalk import METHODS as NEIGHBOURLY
 from plenocli.inverse.spectra.crosstalk import (
     Crosstalk,
@@ -38,6 +39,8 @@ if TYPE_CHECKING:
 Name = str | Path
 LEAST_STEP = 0.002
 """px, of a displacement that is worth another solution."""
+FOLLOWED = 0.02
+"""px: neighbours' light is displaced by multiples of it."""
 TURNS = 2
 """Looks for motion, each with the neighbours' light as the last left it."""
 
@@ -79,6 +82,7 @@ class Demultiplexer:
         self.method, self.register, self.ratio = method, register, ratio
         self.neighbours = self._neighbours(calibration, camera)
         self.moving = _moving(calibration, self.neighbours)
+        self._displaced: dict[tuple[float, ...], NeighbourLight] = {}
         self.prior = light_prior(LensletResponses.of(calibration), known)
         # its superpixels, one for every lenslet, have served
         self.responses = LensletResponses.of(replace(calibration, white=None), threads).prepare()
@@ -130,7 +134,7 @@ class Demultiplexer:
             raise NumericsError(
                 "no lenslet could be demultiplexed", path, "check exposure and calibration"
             )
-        warning = warn_of_misfit(found.residual, found.trace.registration, path)
+        warning = misfit_told(found.residual, found.trace.registration)
         return replace(found, trace=replace(found.trace, warning=warning))
 
     def _alone(self, signal: Readout, noise: Noise | None, method: str, path: Name) -> Spectra:
@@ -162,7 +166,7 @@ class Demultiplexer:
                 found = found or tried
                 break
             last = self._moved(light, aligned, tried.motion, signal, noise)
-            if last.first.misfit >= best.first.misfit and self.register == "auto":
+            if self.register == "auto" and not last.explains_more_than(best):
                 found = found or replace(tried, corrected=())
                 break
             best, found = last, tried
@@ -178,26 +182,46 @@ class Demultiplexer:
         noise: Noise,
     ) -> Crosstalk:
         """The capture where its lenslets are, without what else stands between it and the
-        calibration.
+        calibration: displaced alike by prediction, or each by splines where that explains more.
         """
-        c = aligned.responses
         corrected = aligned.registration.corrected if aligned.registration else ()
-        values = windows_of(c, signal - motion.offset if "offset" in corrected else signal)
-        if "stray light" in corrected:
-            values -= motion.stray * np.nanmean(values, axis=-1, keepdims=True)
-        if "motion" not in corrected:
+        plain = signal - motion.offset if "offset" in corrected else signal
+
+        def solved(c: LensletResponses, light: NeighbourLight) -> Crosstalk:
+            values = windows_of(c, plain)
+            if "stray light" in corrected:
+                values -= motion.stray * np.nanmean(values, axis=-1, keepdims=True)
             return self._crosstalk(c, light, values, noise)
-        shift = displacement(self.responses, c, motion)
-        if self.moving is None or not c.shared:
-            return self._crosstalk(c, light.moved(shift, c.window), values, noise)
+
+        before, after = self.responses, aligned.responses
+        if "motion" not in corrected:
+            return solved(after, light)
+        each = None
+        if self.moving is None or not after.shared:
+            each = solved(after, self._at(light, displacement(before, after, motion)))
+            if self.moving is None:
+                return each
+        shift = motion.at(before.centres[before.sites]).mean(axis=0)
+        whole = np.rint(shift)
+        known = 0 if before.variance is None else before.variance
+        c, shift = replace(before, origin=before.origin + whole.astype(int)), shift - whole
         for last in (False, False, True):
-            c = replace(c, response=self.moving.at(shift).astype(np.float32))
-            found = self._crosstalk(c, light.moved(shift, c.window), values, noise)
+            response, variance = self.moving.at(shift), known + self.moving.variance(shift)
+            c = replace(c, response=response.astype(np.float32), variance=variance)
+            found = solved(c, self._at(light, shift))
             step = np.clip(found.shift_step(self.moving, shift), -0.1, 0.1)
             if last or np.abs(step).max() < LEAST_STEP:
                 break
             shift = shift + step
-        return found
+        return each if each is not None and each.explains_more_than(found) else found
+
+    def _at(self, light: NeighbourLight, shift: np.ndarray) -> NeighbourLight:
+        """Neighbours' light near a displacement (2,) px, the last one kept for the next capture."""
+        steps = FOLLOWED * np.rint(shift / FOLLOWED)
+        place = tuple(float(step) for step in steps)
+        if place not in self._displaced:
+            self._displaced = {place: light.moved(steps, self.responses.calibration)}
+        return self._displaced[place]
 
     def _crosstalk(
         self, c: LensletResponses, light: NeighbourLight, values: np.ndarray, noise: Noise
@@ -262,6 +286,13 @@ def _moving(calibration: Calibration, light: NeighbourLight | None) -> MovingRes
         return MovingResponse(light.camera, calibration)
     except ConfigError:
         return None
+
+
+def tell_misfit(told: Mapping[str, Spectra]) -> None:
+    """One line on all captures, by name, that the calibration does not describe."""
+    warned = {name: found.trace.warning for name, found in told.items() if found.trace.warning}
+    if warned:
+        note(f"warning: {', '.join(warned)}: {next(iter(warned.values()))}")
 
 
 def method_of_white(method: str) -> str:

@@ -32,6 +32,7 @@ DIM = 0.01
 """Share of a band's brightest pixel below which nothing is scaled."""
 KNOWN_TO = 0.03
 """Accuracy that is asked of the prediction."""
+RINGS = 2
 FACTOR_SPREAD = 0.5
 """Of the neighbours' light, near and far: standard deviation of a factor before a capture is looked
 at.
@@ -72,37 +73,23 @@ class NeighbourLight:
         """With `changes` by amounts (change,), in standard deviations."""
         return replace(self, light=self.light + np.tensordot(amounts, self.changes, 1))
 
-    def moved(self, shift: np.ndarray, window: tuple[int, int]) -> NeighbourLight:
-        """Displaced by parts of a pixel.
+    def moved(self, shift: np.ndarray, calibration: Calibration) -> NeighbourLight:
+        """Displaced by parts of a pixel, which is predicted: beside a lenslet's own light, whose
+        edges are sharper than pixels, no spline tells what little of it goes further.
 
         shift: (2,) px, rows and columns.
-        window: rows and columns of a superpixel, px.
+        calibration: that it was predicted for.
         """
-        from scipy.ndimage import shift as displaced
-
         if not np.any(shift):
             return self
-        reach = np.abs(self.offsets).max(axis=0)
-        first = (self.offsets + reach) * np.array(window)
-        tall, wide = (2 * reach + 1) * np.array(window)
-        parts = [
-            (slice(row, row + window[0]), slice(column, column + window[1]))
-            for row, column in first
-        ]
-
-        def moved(light: np.ndarray) -> np.ndarray:
-            out = np.empty_like(light)
-            for place in np.ndindex(light.shape[2:]):
-                picture = np.zeros((tall, wide))
-                for k, part in enumerate(parts):
-                    picture[part] = light[(k, slice(None), *place)].reshape(window)
-                picture = displaced(picture, shift, order=DEGREE)
-                for k, part in enumerate(parts):
-                    out[(k, slice(None), *place)] = picture[part].ravel()
-            return out
-
-        changes = np.stack([moved(change) for change in self.changes])
-        return replace(self, light=moved(self.light), changes=changes)
+        fitted = self.camera.fitted
+        row, column = (np.zeros(2) if fitted is None else np.array(fitted.pixel_shift)) - shift
+        there = self.camera.with_fit((float(row), float(column)), 0.0)
+        offsets, light = _predicted(there, calibration)
+        kept = (offsets[:, None] == self.offsets).all(axis=-1).any(axis=1)
+        offsets, light = offsets[kept], light[kept]
+        changes = np.concatenate([_sizes(offsets, light), self.changes[RINGS:]])
+        return replace(self, offsets=offsets, light=light, changes=changes)
 
     def coupled(self, response: np.ndarray) -> np.ndarray:
         """F of each superpixel for one radiance a lenslet, F being their sum.
@@ -155,20 +142,25 @@ def neighbour_light(camera: Camera, calibration: Calibration) -> NeighbourLight:
             "camera",
             "give the description of the camera that was calibrated",
         )
-    changes = [
-        np.where((far == ring)[:, None, None, None], FACTOR_SPREAD * light, 0)
-        for far in [np.minimum(np.abs(offsets).max(axis=1), 2)]
-        for ring in (1, 2)
-    ]
-    changes += [_predicted(_other_optics(camera, one), calibration)[1] - light for one in np.eye(2)]
+    optics = [_predicted(_other_optics(camera, one), calibration)[1] - light for one in np.eye(2)]
+    changes = np.concatenate([_sizes(offsets, light), optics])
     share = light.sum(axis=(1, 2)) / light.sum(axis=(0, 1, 2))
     kept = (share.max(axis=1) >= LEAST_SHARE) | (offsets == 0).all(axis=1)
     return NeighbourLight(
         offsets=offsets[kept],
         light=light[kept],
-        changes=np.stack(changes)[:, kept],
+        changes=changes[:, kept],
         camera=camera,
     )
+
+
+def _sizes(offsets: np.ndarray, light: np.ndarray) -> np.ndarray:
+    """Changes (RINGS, superpixel, pixel, point, band) of how much light is beside the lenslet, and
+    further away.
+    """
+    ring = np.minimum(np.abs(offsets).max(axis=1), RINGS)
+    rings = np.arange(1, RINGS + 1)[:, None]
+    return FACTOR_SPREAD * (ring == rings)[:, :, None, None, None] * light
 
 
 def _as_measured(camera: Camera, calibration: Calibration) -> Camera:
@@ -258,6 +250,8 @@ class MovingResponse:
 
     def __init__(self, camera: Camera, calibration: Calibration) -> None:
         """Predict the response where it is."""
+        from plenocli.inverse.calibration.calibration import there
+
         why = valid_for(camera, "fresnel")
         if why is not None or calibration.sensor.cfa != "mono":
             raise ConfigError(why or "a colour filter array", "camera", "leave it to splines")
@@ -265,10 +259,29 @@ class MovingResponse:
         here = _even(self.bands, np.zeros(2))
         self.scale = np.nansum(self.measured, axis=0) / here.sum(axis=0)
         self.here = here * self.scale
+        self.window = there(calibration.windows).shape
 
     def at(self, displacement: np.ndarray) -> np.ndarray:
-        """F (pixel, band) with the light displaced by (rows, columns) px."""
-        return self.measured + _even(self.bands, displacement) * self.scale - self.here
+        """F (pixel, band) with the light displaced by (rows, columns) px: what the closed form has
+        wrong goes with it.
+        """
+        return _even(self.bands, displacement) * self.scale + self._wrong(displacement)
+
+    def variance(self, displacement: np.ndarray) -> np.ndarray:
+        """Of `at`, (pixel, band): half of what makes the difference if the wrong stays."""
+        from scipy.ndimage import uniform_filter
+
+        apart = (self._wrong(displacement) - self._wrong(np.zeros(2))) ** 2
+        near = uniform_filter(apart.reshape(*self.window, -1), (3, 3, 0))
+        return np.asarray(near.reshape(apart.shape) / 2)
+
+    def _wrong(self, displacement: np.ndarray) -> np.ndarray:
+        from scipy.ndimage import shift
+
+        wrong = (self.measured - self.here).reshape(*self.window, -1)
+        if np.any(displacement):
+            wrong = shift(np.nan_to_num(wrong), (*displacement, 0), order=DEGREE)
+        return np.asarray(wrong.reshape(self.measured.shape))
 
     def slopes(self, displacement: np.ndarray, step: float = 0.02) -> np.ndarray:
         """Derivatives (2, pixel, band) of `at` by rows and columns, per px."""

@@ -20,7 +20,7 @@ from plenocli.execution.pool import absolute, open_pool
 from plenocli.files.images.mosaic import read_capture
 from plenocli.files.read.captures import describe_capture, named_captures
 from plenocli.forward.scene.white_reference import REFERENCE_REFLECTANCE
-from plenocli.inverse.spectra.demultiplexer import Demultiplexer, method_of_white
+from plenocli.inverse.spectra.demultiplexer import Demultiplexer, method_of_white, tell_misfit
 from plenocli.inverse.spectra.polarisation import stokes
 
 if TYPE_CHECKING:
@@ -333,10 +333,16 @@ class CaptureDemultiplexer:
     def demux(self, path: Name, method: str | None = None) -> tuple[Spectra, dict[str, Any]]:
         """Radiances of one capture, registered to the calibration, and its name and digest.
 
-        method: instead of the settings' one.
+        method: of a reference, whose misfit is told with each capture's.
         """
         capture = read_capture(path, cfa=self.solver.responses.cfa)
-        return self.solver.estimate(capture, path, method), describe_capture(path)
+        found = self.solver.estimate(capture, path, method)
+        if method is None:
+            told = {str(path): found}
+            if self.reference is not None:
+                told[str(self.settings.reference)] = self.reference
+            tell_misfit(told)
+        return found, describe_capture(path)
 
     def write(
         self, done: tuple[Spectra, dict[str, Any]], capture: Name, target: Name

@@ -73,6 +73,7 @@ def motion(shift, turn=0.0):
         offset=0.0,
         stray=0.0,
         sigma=np.zeros(3),
+        beyond_chance=9.0,
         stray_sigma=0.0,
         before=1.0,
         after=1.0,

@@ -220,4 +220,4 @@ def test_blocks_keep_the_measured_sum():
     np.testing.assert_allclose(points[known], response[known], rtol=1e-9)
     for change in light.coupled_changes():
         np.testing.assert_allclose(change.sum(axis=0), 0, atol=1e-9)
-    assert light.moved(np.zeros(2), (SIDE, SIDE)) is light
+    assert light.moved(np.zeros(2), calibration=None) is light

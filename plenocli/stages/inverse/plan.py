@@ -4,6 +4,7 @@ little against the best one.
 
 from __future__ import annotations
 
+import math
 import shlex
 import time
 from dataclasses import dataclass
@@ -25,7 +26,7 @@ class Settings:
     """What the command line says beside the files.
 
     quality_loss: dB of PSNR that may be lost against the best chain.
-    snr_db: of the capture's white noise, None for the sensor's own.
+    snr_db: of the capture's white noise, None for the sensor's at full well.
     capture: file that the commands name.
     seed: of the rehearsal.
     """
@@ -143,7 +144,9 @@ def run_plan(camera_path: Path | str, scene: Path | str, settings: Settings) -> 
     _require_one_picture(camera, camera_path)
     require_tiling(camera, camera_path)
     snr = settings.snr_db
-    noise = sensor_noise(camera) if snr is None else 10 ** (-snr / 20)
+    if snr is None:
+        snr = -20 * math.log10(sensor_noise(camera))
+    noise = 10 ** (-snr / 20)
     shape = camera.object.samples_per_lenslet
     with one_thread():
         matrices = matrix_options(camera, noise)

@@ -108,7 +108,7 @@ def ours(d, y, lam):
 
 
 def fista(d, y, lam):
-    from plenocli.inverse.sparse.l1.solve import fista
+    from tests.reference.fista import fista
 
     return fista(d, y, lam, iterations=300).c
 

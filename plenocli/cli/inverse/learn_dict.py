@@ -1,23 +1,10 @@
 """`plenocli learn-dict`: a sparse dictionary that knows the system matrix."""
 
 from pathlib import Path
-from typing import Any
 
 import click
 
 from plenocli.cli import options
-
-
-class Lambda(click.ParamType):
-    """A positive number, or the word noise."""
-
-    name = "NUMBER|noise"
-
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> float | str:
-        """float, or the word."""
-        return value if value == "noise" else options.POSITIVE.convert(value, param, ctx)
 
 
 @click.command("learn-dict", short_help="Learn a dictionary of object patches for a system matrix.")
@@ -50,11 +37,8 @@ class Lambda(click.ParamType):
 @click.option(
     "--lambda",
     "lam",
-    type=Lambda(),
-    help=(
-        "Weight of |c|_1 with A scaled to unit spectral norm, or `noise`: what codes noise as "
-        "zero; default chosen on held-out patches."
-    ),
+    type=options.POSITIVE,
+    help="Weight of |c|_1 with A scaled to unit spectral norm; default chosen on held-out patches.",
 )
 @click.option(
     "--delta",
@@ -83,7 +67,7 @@ class Lambda(click.ParamType):
 @click.option(
     "--init",
     "initial",
-    type=click.Choice(["patches", "pca", "random"]),
+    type=click.Choice(["patches", "random"]),
     default="patches",
     show_default=True,
     help="Starting atoms; random is the paper's.",
@@ -138,7 +122,7 @@ def command(
     batch: int | None,
     iterations: int,
     snr_db: float,
-    lam: float | str | None,
+    lam: float | None,
     delta: float,
     pull: float,
     incoherence: float,

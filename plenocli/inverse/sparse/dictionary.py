@@ -114,14 +114,14 @@ class Settings:
     lam, delta: weights in the scaled problem (see `Learner`).
     snr_db: noise, sigma^2 = mean(y^2) 10^(-snr/10) over pixels and patches.
     seed: of every random stream.
-    initial: patches, random or pca.
+    initial: patches or random.
     validation: patches on which progress is measured.
     tol: relative duality gap of the coding.
     gradient_steps: of the dictionary step, in place of the closed form; 0 is the closed form.
     pull: batches that the atoms so far are worth to the closed form.
     incoherence: share of a full step that draws atoms apart after the dictionary step.
-    lam_rule: "given", or what chooses lam, at the start and again after the first iteration:
-        "validation" or "noise".
+    lam_rule: "given", or "validation", which chooses lam at the start and again after the first
+        iteration.
     """
 
     atoms: int
@@ -273,18 +273,7 @@ class Learner:
         if self.settings.initial == "random":
             atoms = rng.uniform(-0.5, 0.5, (points, count))
         else:
-            atoms = draw_patches(
-                self.training,
-                self.object_shape,
-                max(count, 2 * points if self.settings.initial == "pca" else 0),
-                rng,
-            )
-            if self.settings.initial == "pca":
-                centred = atoms - atoms.mean(axis=0)
-                basis = np.linalg.svd(centred, full_matrices=False)[0][:, : points - 1]
-                atoms = np.concatenate([basis, centred], axis=1)[:, :count]
-            elif self.settings.initial != "patches":
-                raise ValueError(f"unknown start {self.settings.initial!r}")
+            atoms = draw_patches(self.training, self.object_shape, count, rng)
         return State(0, _with_constant(_unit(atoms, rng)))
 
     def code(self, atoms: np.ndarray, measured: np.ndarray, tol: float | None = None) -> SparseCode:

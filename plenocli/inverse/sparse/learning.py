@@ -11,7 +11,6 @@ import numpy as np
 from plenocli.base.progress import note
 from plenocli.inverse.picture.solvers.least_squares import Svd
 from plenocli.inverse.sparse.dictionary import Learner, Settings, State
-from plenocli.inverse.sparse.l1.solve import noise_lambda
 
 LAMBDAS = np.logspace(-7, -4, 13)
 """Values among which `lam=None` chooses by validation PSNR, in the scaled problem."""
@@ -53,13 +52,7 @@ def advance(machine: Learner, state: State) -> tuple[Learner, State]:
 
 
 def _with_chosen_lambda(machine: Learner, atoms: np.ndarray) -> Learner:
-    """The learner with the largest lambda of the best validation PSNR for some atoms, or with that
-    of the noise.
-    """
-    if machine.settings.lam_rule == "noise":
-        lam = noise_lambda(machine.seen @ atoms[:, 1:], machine.sigma)
-        note(f"lambda = {lam:.2e}, from the noise")
-        return machine.with_lambda(lam)
+    """The learner with the largest lambda of the best validation PSNR for some atoms."""
     table = machine.validate_path(atoms, LAMBDAS)
     top = max(quality for _, quality, _ in table)
     best, quality, nonzeros = max(row for row in table if row[1] > top - INDIFFERENT_DB)

@@ -37,10 +37,10 @@ class Settings:
     atoms: None for one an object point.
     batch: patches an iteration, None for 4 an atom.
     iterations: in all.
-    lam: None chooses on the validation patches, "noise" takes it from the noise.
+    lam: None chooses on the validation patches.
     delta: weight of |A Phi|^2.
     snr_db: noise of the measurements.
-    initial: patches, pca or random.
+    initial: patches or random.
     gradient_steps: of the dictionary step; 0 is its closed form.
     pull: batches that the atoms so far are worth to the closed form.
     incoherence: share of a full step that draws atoms apart.
@@ -52,7 +52,7 @@ class Settings:
     atoms: int | None = None
     batch: int | None = None
     iterations: int = 10
-    lam: float | str | None = None
+    lam: float | None = None
     delta: float = 1e-3
     snr_db: float = 60.0
     initial: str = "patches"
@@ -303,7 +303,7 @@ def _resolve(
         return LearnerSettings(
             atoms=atoms,
             batch=settings.batch or 4 * atoms,
-            lam=settings.lam if isinstance(settings.lam, float) else math.nan,
+            lam=math.nan if settings.lam is None else settings.lam,
             delta=settings.delta,
             snr_db=settings.snr_db,
             seed=settings.seed,
@@ -311,10 +311,10 @@ def _resolve(
             gradient_steps=settings.gradient_steps,
             pull=settings.pull,
             incoherence=settings.incoherence,
-            lam_rule=_rule(settings),
+            lam_rule="validation" if settings.lam is None else "given",
         )
     asked, stored, default = asdict(settings), asdict(earlier.settings), asdict(Settings())
-    wanted = [name for name in ("atoms", "batch", "lam") if asked[name] not in (None, "noise")]
+    wanted = [name for name in ("atoms", "batch", "lam") if asked[name] is not None]
     wanted += [
         name
         for name in (
@@ -340,12 +340,6 @@ def _resolve(
                 ),
             )
     return earlier.settings
-
-
-def _rule(settings: Settings) -> str:
-    if settings.lam == "noise":
-        return "noise"
-    return "validation" if settings.lam is None else "given"
 
 
 def _tell(state: State) -> None:

@@ -5,8 +5,7 @@ No factor 1/2: lambda is the paper's (Berkner et al. 2013, section 2-3-2); sklea
 lambda / 2, up to their 1/M. A signal is certified by its relative duality gap (P - dual) / P,
 computed in float64. First-order methods are hopeless on a plenoptic system matrix (its Gram matrix
 spans more than ten decades), so the working solver is an active-set Newton method (after the
-feature-sign search of Lee et al., NIPS 2006, with many atoms entering at a time). `fista`, of
-the kinds that the paper names, carries the same certificate.
+feature-sign search of Lee et al., NIPS 2006, with many atoms entering at a time).
 """
 
 from __future__ import annotations
@@ -90,68 +89,6 @@ def lambda_path(
             workers,
         )
         yield lam, code
-
-
-def noise_lambda(dictionary: ArrayLike, sigma: float, *, weights: ArrayLike | None = None) -> float:
-    """The lambda with which white noise alone would, for most signals, be coded as zero.
-
-    An upper guide: the best reconstruction wants a smaller lambda, since bias costs more than a few
-    false atoms.
-
-    dictionary: (M, L) D.
-    sigma: standard deviation of the noise.
-    weights: (L,) w_j > 0, default 1.
-
-    Returns 2 sigma sqrt(2 ln L) max_j |D_j| / w_j.
-    The universal threshold (Chen, Donoho & Saunders 2001, section 5.2), without the factor 1/2.
-    """
-    d = np.asarray(dictionary, float)
-    norm = np.linalg.norm(d, axis=0) / (1 if weights is None else np.asarray(weights, float))
-    return float(2 * sigma * np.sqrt(2 * np.log(max(d.shape[1], 2))) * norm.max())
-
-
-def fista(
-    dictionary: ArrayLike,
-    signals: ArrayLike,
-    lam: float,
-    *,
-    weights: ArrayLike | None = None,
-    free: Sequence[int] = (),
-    tol: float = 1e-4,
-    iterations: int = 300,
-) -> SparseCode:
-    """The same problem by accelerated proximal gradient with adaptive restart.
-
-    On a plenoptic system matrix the gap stays near 1 for thousands of iterations, and says so.
-
-    dictionary, signals, lam, weights, free: as of sparse_code.
-    tol: relative duality gap of every signal at which it stops.
-    iterations: after which it stops at the latest.
-
-    Returns the code; passes are iterations.
-    Raises ValueError as `prepare`.
-    Beck & Teboulle 2009; O'Donoghue & Candes 2015.
-    """
-    problem = prepare(dictionary, signals, lam, weights, free)
-    gram = problem.d.T @ problem.d
-    step = 1.0 / max(np.linalg.norm(gram, 2), np.finfo(float).tiny)
-    c = np.zeros_like(problem.b)
-    ahead, momentum = c, np.ones(len(c))
-    objective, gap, _ = duality_gap(problem.d, problem.y, c, problem.threshold)
-    done = 0
-    while done < iterations and np.any(gap > tol):
-        done += 1
-        stepped = ahead - step * (ahead @ gram - problem.b)
-        stepped = np.sign(stepped) * np.maximum(np.abs(stepped) - step * problem.threshold, 0)
-        restart = np.einsum("ij,ij->i", ahead - stepped, stepped - c) > 0
-        after = np.where(restart, 1.0, (1 + np.sqrt(1 + 4 * momentum**2)) / 2)
-        pull = np.where(restart, 0.0, (momentum - 1) / after)
-        ahead, c, momentum = stepped + pull[:, None] * (stepped - c), stepped, after
-        if done % 10 == 0 or done == iterations:
-            objective, gap, _ = duality_gap(problem.d, problem.y, c, problem.threshold)
-    return SparseCode(
-        c=problem.restore(c), objective=objective, gap=gap, passes=np.full(len(c), done)
-    )
 
 
 BLOCK = 1024

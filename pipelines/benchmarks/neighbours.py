@@ -9,6 +9,7 @@ neighbours' light from the description, with the sensor 1 % further away and the
 where --wrong says so.
 
     python pipelines/benchmarks/neighbours.py four
+    python pipelines/benchmarks/neighbours.py singlet --joint
     python pipelines/benchmarks/neighbours.py choice --cases 40
 """
 
@@ -121,10 +122,8 @@ class Bench:
     """One camera, its captures and its calibration."""
 
     def __init__(self, described, superpixels, samples, lines=False):
-        from plenocli.forward.accuracy.dial import pif_builder
         from plenocli.forward.scene.light import Quadrature, broadband
         from plenocli.forward.scene.tables import illuminant
-        from plenocli.forward.sensor.exposure import StoredMatrix
 
         self.described, self.samples = described, samples
         self.camera = self.described.replace(**{"object.samples_per_lenslet": (samples, samples)})
@@ -132,18 +131,28 @@ class Bench:
         if lines:
             bands = np.array(self.camera.light.wavelengths)
             self.light = Quadrature(bands, np.full(len(bands), 1 / len(bands)))
-        model = "fresnel" if lines else "auto"
-        self.matrices = {}
-        for w in {*map(float, self.light.wavelengths), *self.camera.light.wavelengths}:
-            sides = (superpixels, superpixels)
-            builder = pif_builder(self.camera, w, superpixels=sides, model=model)
-            matrix = np.concatenate([block for _, block in builder.blocks()], axis=2)
-            self.matrices[w] = StoredMatrix(matrix, builder.offsets)
+        self.model, self.superpixels = "fresnel" if lines else "auto", superpixels
+        self.matrices = self.still = self._seen_by(self.camera)
         self.calibration, white = self._calibrated()
         from plenocli.inverse.spectra.demultiplexer import Demultiplexer
 
         alone = Demultiplexer(self.calibration, method="pinv", ratio=True)
         self.white = np.median(alone.estimate(white, "white").value, axis=(1, 2), keepdims=True)
+
+    def _seen_by(self, camera):
+        from plenocli.forward.accuracy.dial import pif_builder
+        from plenocli.forward.sensor.exposure import StoredMatrix
+
+        found, sides = {}, (self.superpixels, self.superpixels)
+        for w in {*map(float, self.light.wavelengths), *camera.light.wavelengths}:
+            builder = pif_builder(camera, w, superpixels=sides, model=self.model)
+            matrix = np.concatenate([block for _, block in builder.blocks()], axis=2)
+            found[w] = StoredMatrix(matrix, builder.offsets)
+        return found
+
+    def move(self, shift):
+        """From now on captures are of pixels displaced by (rows, columns) px."""
+        self.matrices = self._seen_by(self.camera.with_fit(tuple(shift), 0.0))
 
     def shoot(self, scene, seed, exposure=1.0, light=None):
         """One capture."""
@@ -179,7 +188,7 @@ class Bench:
         through, even = [], []
         for photons, w in zip(self.light.photons, self.light.wavelengths):
             through.append([photons * filter_transmittance(f, w) for f in filters])
-            light = self.matrices[float(w)].matrix.sum(axis=(0, 2), dtype=float)
+            light = self.still[float(w)].matrix.sum(axis=(0, 2), dtype=float)
             even.append(photons * (back @ light))
         n = self.samples
         pictures = [
@@ -265,6 +274,41 @@ def choice(cases, first, superpixels, samples):
     )
 
 
+def joint(name, seeds):
+    """Print what LMMSE of the joint estimate over 3x3 lenslets makes of the lenslets' means beside
+    demux, one factor a band left free: one matrix of 12 points a side, 45 dB.
+    """
+    import plenocli.api as pc
+    from plenocli.forward.sensor.exposure import ExposureOptions, simulate_capture
+    from plenocli.inverse.spectra.demultiplexer import Demultiplexer
+
+    camera = camera_of(name).replace(**{"object.samples_per_lenslet": (12, 12)})
+    bench = Bench(camera, 3, 12, True)
+    bands = sorted(map(float, bench.light.wavelengths))
+    matrix = pc.system_matrix(camera, wavelengths=bands, superpixels=(3, 3), model="fresnel")
+    solver = Demultiplexer(bench.calibration, camera=camera, ratio=True)
+    print("| scene, seed | pinv | auto | joint LMMSE |")
+    for kind in SCENES:
+        for seed in seeds:
+            scene = Patches(kind, seed)
+            truth, shot = bench.truths(scene)[0], bench.shoot(scene, 7)
+            told = ExposureOptions(seed=7, snr_db=45.0)
+            seen = simulate_capture(
+                bench.camera, bench.light, scene, told, matrices=bench.matrices
+            ).capture
+            picture = np.asarray(
+                pc.reconstruct(seen, matrix, camera=camera, method="lmmse").value, float
+            )
+            blocks = picture.reshape(len(bands), COUNT[0], 12, COUNT[1], 12)
+            found = [solver.estimate(shot, "shot", m).value for m in ("pinv", "auto")]
+            cells = []
+            for value in (*found, blocks.mean(axis=(2, 4))):
+                v, t = (one[:, 1:-1, 1:-1].reshape(len(bands), -1) for one in (value, truth))
+                factor = (v * t).sum(axis=1) / (v * v).sum(axis=1)
+                cells.append(f"{np.sqrt(np.mean((factor[:, None] * v - t) ** 2)):.5f}")
+            print(f"| {kind}, {seed} | " + " | ".join(cells) + " |", flush=True)
+
+
 def speed(bench):
     """CPU seconds of both solutions for 100 x 100 lenslets of 400 pixels."""
     from plenocli.inverse.spectra.coupled import coupled, fine
@@ -302,6 +346,9 @@ def main():
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("camera", choices=[*CAMERAS, "choice"])
+    parser.add_argument(
+        "--joint", action="store_true", help="the joint estimate of reconstruct beside demux"
+    )
     parser.add_argument("--cases", type=int, default=40, help="of choice")
     parser.add_argument("--first", type=int, default=9000, help="seed of the first case of choice")
     parser.add_argument("--superpixels", type=int, default=3, help="a side, of the captures")
@@ -312,13 +359,21 @@ def main():
         help="light of four lines, by the paraxial model: nothing but neighbours, in minutes",
     )
     parser.add_argument("--wrong", action="store_true", help="distance and filters 1 % off")
+    parser.add_argument(
+        "--moved", type=float, nargs=2, help="px, rows and columns, after calibration"
+    )
     parser.add_argument("--seeds", type=int, nargs="+", default=[21])
     options = parser.parse_args()
     if options.camera == "choice":
         choice(options.cases, options.first, options.superpixels, options.samples)
         return
+    if options.joint:
+        joint(options.camera, options.seeds)
+        return
     described = camera_of(options.camera)
     bench = Bench(described, options.superpixels, options.samples, options.lines)
+    if options.moved:
+        bench.move(options.moved)
     table(bench, options.wrong, options.seeds)
     speed(bench)
 

@@ -15,6 +15,8 @@ import numpy as np
 from plenocli.forward.camera.quadrature import gauss
 from plenocli.forward.volume.optics import VolumeOptics
 
+LEAST_MODE = 2e-5
+"""Size of the smallest mode of a lenslet's field that is followed, over that of the largest."""
 FADE_TERMS = 10
 """More terms of a field that fades over its lenslet."""
 
@@ -29,33 +31,43 @@ def terms_for(optics: VolumeOptics, error: float) -> int:
     return math.ceil(turns + 2.2 * max(turns, 1.0) ** (1 / 3) * math.log10(1 / error) ** (2 / 3))
 
 
-def sampling(optics: VolumeOptics, terms: int) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes over a lenslet, m from its middle, and the matrix (term, node) that takes the
-    field there into Legendre terms.
+def sampling(optics: VolumeOptics, terms: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Nodes over a lenslet, m from its middle; the matrix (mode, node) that takes the field there
+    into modes of unit light; and these in Legendre terms (term, mode).
+
+    Modes are what fields of the aperture make over a lenslet, those beyond LEAST_MODE: in focus the
+    prolate functions, two thirds as many as terms.
     """
-    nodes, weights = gauss(terms + 4)
+    nodes, weights = gauss(terms)
     half = optics.open_width / 2
     left = 1 / optics.sensor_distance + 1 / optics.pupil_distance - 1 / optics.focal_length
     lens = np.exp(0.5j * optics.k * left * (half * nodes) ** 2)
-    degrees = np.arange(terms) + 0.5
-    basis = np.polynomial.legendre.legvander(nodes, terms - 1).T
-    return half * nodes, degrees[:, None] * basis * (weights * lens)
+    norm = np.sqrt(half / (np.arange(terms) + 0.5))
+    # to terms of unit light
+    onto = np.polynomial.legendre.legvander(nodes, terms - 1).T / norm[:, None]
+    onto = half * onto * (weights * lens)
+    slopes = gauss(2 * terms)[0] * optics.k * half * optics.aperture / optics.magnification
+    basis, size, _ = np.linalg.svd(onto @ np.exp(1j * np.outer(nodes, slopes)))
+    basis = basis[:, : np.count_nonzero(size > LEAST_MODE * size[0])]
+    return half * nodes, basis.conj().T @ onto, basis / norm[:, None]
 
 
 def to_pixels(
-    optics: VolumeOptics, terms: int, axis: int, neighbours: int, count: int
+    optics: VolumeOptics, basis: np.ndarray, axis: int, neighbours: int, count: int
 ) -> np.ndarray:
-    """What Legendre terms over the lenslets q = p + j make at the nodes of superpixel p's pixels.
+    """What modes over the lenslets q = p + j make at the nodes of superpixel p's pixels.
 
+    basis: (term, mode) from `sampling`.
     neighbours: j runs from -neighbours to neighbours.
     count: of nodes a pixel.
 
-    Returns (pixel * node, j * term) complex.
+    Returns (pixel * node, j * mode) complex.
     """
     from scipy.special import spherical_jn
 
     t = optics.pixel_nodes(count, axis)[0].ravel()
     half, d = optics.open_width / 2, optics.sensor_distance
+    terms = len(basis)
     faded = _fade(terms)
     parts = []
     for j in range(-neighbours, neighbours + 1):
@@ -71,7 +83,7 @@ def to_pixels(
             # mirrored for the other side: P_n(-v) = (-1)^n P_n(v)
             turn = np.sign(j) ** (np.add.outer(np.arange(len(faded)), np.arange(terms)) % 2)
             part = part @ (faded * turn)
-        parts.append(part)
+        parts.append(part @ basis)
     return np.concatenate(parts, axis=1) / math.sqrt(optics.wavelength * d)
 
 

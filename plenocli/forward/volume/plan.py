@@ -15,10 +15,10 @@ from plenocli.base.errors import NumericsError
 from plenocli.forward.accuracy.machine_rate import product_rate
 from plenocli.forward.propagation.plan import NOMINAL_RATE
 from plenocli.forward.volume.arriving import ArrivingField
-from plenocli.forward.volume.lenslets import terms_for
+from plenocli.forward.volume.lenslets import sampling, terms_for
 from plenocli.forward.volume.optics import VolumeOptics
 from plenocli.forward.volume.rays import RayPlane
-from plenocli.forward.volume.waves import WavePlane, WaveSettings
+from plenocli.forward.volume.waves import WavePlane, WaveSettings, near
 
 WAVES = ((1, 2), (2, 3), (3, 4), (4, 4), (6, 5), (9, 7))
 """Rungs of wave optics: neighbours on each side whose fields interfere, nodes across a pixel."""
@@ -38,7 +38,7 @@ DEEPER = 1.6
 """Error of deeper points over that of the deepest that is tried (measured to 17 lenslets)."""
 BOX = 2
 """Points along each side of a voxel that stand for it, its light being their mean."""
-OVERHEAD = 3.6
+OVERHEAD = 2.5
 """Time over that of the products."""
 
 
@@ -152,10 +152,7 @@ def plan_volume(
         box=box,
         seconds=0.0,
         nominal_seconds=0.0,
-        bytes=4
-        * math.prod(optics.pixels)
-        * math.prod(samples)
-        * sum((2 * r + 1) ** 2 for r in reach),
+        bytes=4 * math.prod(optics.pixels) * math.prod(samples) * sum(near(r).sum() for r in reach),
         considered=tuple(considered),
     )
     return replace(
@@ -250,11 +247,15 @@ def _seconds(optics: VolumeOptics, plan: VolumePlan, rate: float) -> float:
         count = (plan.pixel_nodes * max(optics.pixels) + 1) ** 2
         per_plane = places * count * 4e-7
         return len(optics.lines) * per_plane * len(plan.reach)
+    # the products for places on the diagonal are half as many
+    twins = sum(i == j for i, j in unique_places(optics, plan.samples, plan.box))
+    square = optics.round and optics.pixels[0] == optics.pixels[1]
+    places -= twins / 2 if square else 0
+    modes = sampling(optics, plan.terms)[2].shape[1]
+    window = (2 * plan.neighbours + 1) * modes
+    rows, columns = (n * plan.pixel_nodes for n in optics.pixels)
     total = 0.0
-    window = (2 * plan.neighbours + 1) * plan.terms
     for reach in plan.reach:
-        lenslets = 2 * reach + 1
-        rows, columns = (lenslets * n * plan.pixel_nodes for n in optics.pixels)
-        wide = (lenslets + 2 * plan.neighbours) * plan.terms
-        total += 8.0 * rows * window * (wide + columns)
+        lenslets, about = int(near(reach).sum()), 2 * plan.neighbours * (2 * reach + 1)
+        total += 8.0 * rows * window * ((lenslets + about) * modes + lenslets * columns)
     return len(optics.lines) * OVERHEAD * places * total / rate

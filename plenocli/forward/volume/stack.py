@@ -4,6 +4,7 @@ lenslets.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -14,6 +15,7 @@ from plenocli.base.errors import NumericsError
 from plenocli.forward.propagation.accuracy_record import AccuracyRecord
 from plenocli.forward.volume.optics import VolumeOptics
 from plenocli.forward.volume.plan import VolumePlan, unique_places
+from plenocli.forward.volume.waves import near
 
 SUM_SLACK = 5e-3
 """By which a column may exceed the light that enters the lenslets."""
@@ -142,10 +144,10 @@ def plane_kernels(
     Returns (entry, pixel, point) and lenslet offsets (entry, 2), as Stack has them.
     Raises NumericsError where a point's light on the sensor is not what entered its lenslets.
     """
-    lines, half = [plan.plane(o, number) for o in optics.lines], 2 * plan.reach[number] + 1
+    lines = [plan.plane(o, number) for o in optics.lines]
     fine = tuple(n * plan.box for n in plan.samples)
-    rows, columns = optics.pixels
-    total = np.zeros((*plan.samples, half, rows, half, columns), np.float32)
+    # voxels as well as places follow from a few
+    sums = dict.fromkeys(unique_places(optics, plan.samples, 1), np.float32(0))
     for i, j in unique_places(optics, plan.samples, plan.box):
         places = [((k + 0.5) / n - 0.5) * optics.object_pitch for k, n in zip((i, j), fine)]
         column, entered = lines[0].column(*places)
@@ -155,12 +157,16 @@ def plane_kernels(
         column, entered = column / len(lines), entered / len(lines)
         _guard(optics, number, float(column.sum(dtype=float)), entered, plan)
         for (a, b), image in _images((i, j), column, fine, optics).items():
-            total[a // plan.box, b // plan.box] += image
-    total /= plan.box**2
-    kernels = total.transpose(2, 4, 3, 5, 0, 1).reshape(half**2, rows * columns, -1)
-    side = np.arange(half) - plan.reach[number]
-    offsets = np.stack(np.meshgrid(side, side, indexing="ij"), axis=-1).reshape(-1, 2)
-    return np.ascontiguousarray(kernels), offsets
+            voxel = a // plan.box, b // plan.box
+            if voxel in sums:
+                sums[voxel] = sums[voxel] + image
+    kept = near(plan.reach[number])
+    offsets = np.argwhere(kept) - plan.reach[number]
+    kernels = np.empty((len(offsets), *optics.pixels, *plan.samples), np.float32)
+    for voxel, total in sums.items():
+        for (a, b), image in _images(voxel, total, plan.samples, optics).items():
+            kernels[..., a, b] = image.transpose(0, 2, 1, 3)[kept] / plan.box**2
+    return kernels.reshape(len(offsets), math.prod(optics.pixels), -1), offsets
 
 
 def _images(
@@ -207,4 +213,5 @@ def _working(optics: VolumeOptics, plan: VolumePlan) -> int:
     wide = (lenslets + 2 * plan.neighbours) * max(plan.terms, 1)
     fields = 8 * (2 * rows * wide + 2 * wide**2 + rows * optics.pixels[1] * plan.pixel_nodes)
     columns_of_plane = 4 * lenslets**2 * optics.pixels[0] * optics.pixels[1]
-    return budget().threads * (fields + (2 + plan.samples[0] * plan.samples[1]) * columns_of_plane)
+    voxels = len(unique_places(optics, plan.samples, 1)) + plan.samples[0] * plan.samples[1]
+    return budget().threads * (fields + (2 + voxels) * columns_of_plane)

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.lib.stride_tricks import as_strided
 
 from plenocli.forward.volume.arriving import ArrivingField
 from plenocli.forward.volume.lenslets import sampling, to_pixels
@@ -38,17 +37,17 @@ class WavePlane:
         self._half = settings.reach * 2 + 1
         far = (settings.reach + 1) * optics.object_pitch * math.sqrt(2)
         self._field = ArrivingField(optics, depth, far)
-        inner, self._onto = sampling(optics, settings.terms)
+        inner, onto, self._basis = sampling(optics, settings.terms)
         middles = np.arange(-settings.reach, settings.reach + 1) * optics.pitch
         self._nodes = (middles[:, None] + inner).ravel()
-        self._onto = self._onto.astype(np.complex64)
+        self._onto = onto.astype(np.complex64)
 
     @cached_property
     def _pixels(self) -> tuple[np.ndarray, ...]:
-        """Of both axes: terms to nodes of pixels, with the root of the nodes' weights."""
+        """Of both axes: modes to nodes of pixels, with the root of the nodes' weights."""
         s, found = self.settings, []
         for axis in (0, 1):
-            map_ = to_pixels(self.optics, s.terms, axis, s.neighbours, s.pixel_nodes)
+            map_ = to_pixels(self.optics, self._basis, axis, s.neighbours, s.pixel_nodes)
             weights = self.optics.pixel_nodes(s.pixel_nodes, axis)[1]
             roots = np.tile(np.sqrt(weights), self.optics.pixels[axis])
             found.append((roots[:, None] * map_).astype(np.complex64))
@@ -58,43 +57,57 @@ class WavePlane:
         """Light of the point at (y, x), m from the middle lenslet's own on the object's side.
 
         Returns the share of its light on every pixel (superpixel row, pixel row, superpixel column,
-        pixel column) and the share that enters the lenslets there.
+        pixel column), zero beyond `near`, and the share that enters the lenslets there.
         """
-        terms, entered = self._terms(y, x)
-        s, rows, columns = self.settings, *self.optics.pixels
-        window, step = (2 * s.neighbours + 1) * s.terms, s.terms
-        behind_rows = np.matmul(self._pixels[0], _windows(terms, window, step, self._half))
-        lines = np.ascontiguousarray(behind_rows.reshape(-1, terms.shape[1]))
-        ones = np.repeat(np.eye(columns, dtype=np.float32), 2 * s.pixel_nodes, axis=0)
+        modes, entered = self._modes(y, x)
+        o, s, step = self.optics, self.settings, self._basis.shape[1]
+        window, nodes = (2 * s.neighbours + 1) * step, len(self._pixels[0])
+        # a point on the diagonal: what is above it is what is below, transposed
+        twin = y == x and o.round and o.pixels[0] == o.pixels[1]
+        wanted = near(s.reach) & (np.tri(self._half, dtype=bool) if twin else True)
+        low, high = _ends(wanted.T)
+        behind = np.empty((self._half * nodes, modes.shape[1]), np.complex64)
+        for q in range(self._half):
+            part = slice(low[q] * step, high[q] * step + window - step if high[q] else 0)
+            rows = modes[q * step : q * step + window, part]
+            np.matmul(self._pixels[0], rows, out=behind[q * nodes : (q + 1) * nodes, part])
+        low, high = _ends(wanted)
+        ones = np.repeat(np.eye(o.pixels[1], dtype=np.float32), 2 * s.pixel_nodes, axis=0)
         to = np.ascontiguousarray(self._pixels[1].T)
-        out = np.empty((self._half, rows, self._half, columns), np.float32)
+        out = np.zeros((self._half, o.pixels[0], self._half, o.pixels[1]), np.float32)
         for p in range(self._half):
-            field = lines[:, p * step : p * step + window] @ to
-            parts = field.view(np.float32)
+            rows = behind[low[p] * nodes : high[p] * nodes, p * step : p * step + window]
+            parts = (rows @ to).view(np.float32)
             light = np.square(parts, out=parts) @ ones
-            out[:, :, p] = light.reshape(self._half, rows, s.pixel_nodes, columns).sum(2)
+            light = light.reshape(-1, o.pixels[0], s.pixel_nodes, o.pixels[1]).sum(2)
+            out[low[p] : high[p], :, p] = light
+            if twin:
+                out[p, :, p + 1 :] = out[p + 1 :, :, p].transpose(2, 0, 1)
         return out, entered
 
-    def _terms(self, y: float, x: float) -> tuple[np.ndarray, float]:
-        """Legendre terms of all lenslets, none beyond those of the reach: (lenslet row * term,
-        lenslet column * term), and the share of light in them.
+    def _modes(self, y: float, x: float) -> tuple[np.ndarray, float]:
+        """Modes of all lenslets, none beyond those of the reach: (lenslet row * mode, lenslet
+        column * mode), and the share of light in them.
         """
         o, s, n = self.optics, self.settings, self._half
         field = self._field.at(self._nodes / o.magnification - y, self._nodes / o.magnification - x)
-        field = field.astype(np.complex64).reshape(n, -1, n, self._onto.shape[1])
-        half = np.matmul(self._onto, field.reshape(n, self._onto.shape[1], -1))
-        half = half.reshape(n * s.terms, n, -1).transpose(1, 2, 0)
-        both = np.matmul(self._onto, half).transpose(2, 0, 1) / np.float32(o.magnification)
-        squares = (o.open_width / (2 * np.arange(s.terms) + 1)) ** 1.0
-        light = (np.abs(both.reshape(n, s.terms, n, s.terms)) ** 2).sum((0, 2))
-        entered = float(squares @ light @ squares)
-        margin = s.neighbours * s.terms
-        return np.pad(both.reshape(n * s.terms, -1), margin), entered
+        step, count = self._onto.shape
+        field = field.astype(np.complex64).reshape(n, count, n * count)
+        half = np.matmul(self._onto, field).reshape(n * step * n, count)
+        both = (half @ self._onto.T / np.float32(o.magnification)).reshape(n * step, n * step)
+        light = (np.abs(both.reshape(n, step, n, step)) ** 2).sum((1, 3))
+        entered = float(light[near(s.reach)].sum(dtype=float))
+        return np.pad(both, s.neighbours * step), entered
 
 
-def _windows(terms: np.ndarray, window: int, step: int, count: int) -> np.ndarray:
-    """(count, window, column) views of rows that start every `step`."""
-    row, column = terms.strides
-    return as_strided(
-        terms, (count, window, terms.shape[1]), (step * row, row, column), writeable=False
-    )
+def near(reach: int) -> np.ndarray:
+    """(row, column) of the superpixels about a lenslet: where light lands no farther than `reach`
+    pitches from a point that is somewhere before it.
+    """
+    least = np.maximum(np.abs(np.arange(-reach, reach + 1)) - 1, 0)
+    return np.hypot(least[:, None], least) < max(reach, 1)
+
+
+def _ends(wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """First row that is wanted of every column, and the one after the last: 0 where none is."""
+    return wanted.argmax(0), (len(wanted) - wanted[::-1].argmax(0)) * wanted.any(0)

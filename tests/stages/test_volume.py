@@ -3,6 +3,7 @@
 import csv
 import xml.etree.ElementTree as tree
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import OpenImageIO as oiio
@@ -17,6 +18,7 @@ from plenocli.files.images.mosaic import read_capture
 from plenocli.files.images.tiff_stack import read_tiff_volume, write_volume_tiff
 from plenocli.files.results.stacks import read_stack
 from plenocli.files.results.volumes import read_volume
+from plenocli.inverse.volume.superpixels import white_superpixel
 from plenocli.stages.evaluation.score import run_score
 from plenocli.stages.forward.capture_settings import Settings as Capture
 from plenocli.stages.forward.capture_sim import run_capture_sim
@@ -70,6 +72,7 @@ def test_the_kernels_of_a_microscope_are_read_as_they_were_written(camera, tmp_p
 def test_a_plan_of_a_volume_writes_nothing(camera, tmp_path):
     report = run_simulate_pif(camera, None, Settings(), explain=True)
     assert report.output is None and "waves" in report.line() and report.seconds > 0
+    assert "halfway between planes" in report.line()
 
 
 @pytest.mark.parametrize(
@@ -219,6 +222,14 @@ def test_a_capture_of_another_camera_is_refused(seen, tmp_path):
         Image.fromarray(np.full((40, 40), 9, np.uint8)).save(tmp_path / "a.png")
         run_volume(tmp_path / "a.png", tmp_path / "v.h5", seen / "stack.h5")
     assert not (tmp_path / "v.h5").exists()
+
+
+def test_another_lattice_than_that_of_the_kernels_is_refused():
+    grid = SimpleNamespace(lattice="hexagonal", pitch=(13.0, 15.0))
+    grid.centres, grid.valid = np.full((2, 2, 2), 20.0), np.ones((2, 2), bool)
+    known = SimpleNamespace(grid=grid, white=SimpleNamespace(flat=np.ones((40, 40))))
+    with pytest.raises(InputError, match="hexagonal lattice"):
+        white_superpixel(known, (13, 15))
 
 
 def test_a_photographic_camera_with_planes_has_kernels(tmp_path):

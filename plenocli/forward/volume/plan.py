@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -56,6 +57,7 @@ class VolumePlan:
     seconds, nominal_seconds: of one core of this machine, and of one at the nominal rate.
     bytes: of the kernels.
     considered: (rung, error) of all that were tried.
+    between: share of a point's light that is elsewhere halfway between planes than interpolated.
     """
 
     model: str
@@ -72,6 +74,7 @@ class VolumePlan:
     nominal_seconds: float
     bytes: int
     considered: tuple[tuple[str, float], ...]
+    between: float
 
     @property
     def rung(self) -> str:
@@ -152,8 +155,12 @@ def plan_volume(
         box=box,
         seconds=0.0,
         nominal_seconds=0.0,
-        bytes=4 * math.prod(optics.pixels) * math.prod(samples) * sum(near(r).sum() for r in reach),
+        bytes=4
+        * math.prod(optics.pixels)
+        * math.prod(samples)
+        * sum(int(near(r).sum()) for r in reach),
         considered=tuple(considered),
+        between=_between(optics, (nodes, neighbours)),
     )
     return replace(
         plan,
@@ -186,20 +193,39 @@ def _blur(optics: VolumeOptics, depth: float) -> float:
 
 def _error(optics: VolumeOptics, candidate: tuple[int, int], depth: float) -> float:
     """Of a rung for one point, against the finest."""
-    nodes, neighbours = candidate
-    reach = math.ceil(_blur(optics, depth) / optics.object_pitch) + 2
-    terms = terms_for(optics, 1e-5)
-    finest = WaveSettings(neighbours=FINEST[0], pixel_nodes=FINEST[1], terms=terms, reach=reach)
     deepest = max(_blur(optics, z) for z in optics.depths)
     deeper = DEEPER if deepest > 1.01 * TRIED_BLUR * optics.object_pitch else 1.0
-    place = 0.31 * optics.object_pitch, 0.17 * optics.object_pitch
-    truth, _ = WavePlane(optics, depth, finest).column(*place)
-    if neighbours == 0:
-        tried, _ = RayPlane(optics, depth, reach, nodes).column(*place)
-    else:
-        settings = replace(finest, neighbours=neighbours, pixel_nodes=nodes)
-        tried, _ = WavePlane(optics, depth, settings).column(*place)
+    reach = math.ceil(_blur(optics, depth) / optics.object_pitch) + 2
+    tried = _column(optics, candidate, depth, reach)
+    truth = _column(optics, (FINEST[1], FINEST[0]), depth, reach)
     return deeper * float(0.5 * np.abs(tried - truth).sum(dtype=float))
+
+
+@lru_cache(maxsize=4)
+def _column(optics: VolumeOptics, rung: tuple[int, int], depth: float, reach: int) -> np.ndarray:
+    """Light of a point off a lenslet's middle by a rung."""
+    nodes, neighbours = rung
+    place = 0.31 * optics.object_pitch, 0.17 * optics.object_pitch
+    if neighbours == 0:
+        return RayPlane(optics, depth, reach, nodes).column(*place)[0]
+    settings = WaveSettings(
+        neighbours=neighbours, pixel_nodes=nodes, terms=terms_for(optics, 1e-5), reach=reach
+    )
+    return WavePlane(optics, depth, settings).column(*place)[0]
+
+
+def _between(optics: VolumeOptics, rung: tuple[int, int]) -> float:
+    """Share of a point's light that is elsewhere, halfway between the planes nearest to the focus,
+    than what is between those planes' light: there it changes most. 0 of one plane.
+    """
+    depths = np.sort(optics.depths)
+    if len(depths) == 1:
+        return 0.0
+    k = int(np.argmin(np.abs(depths[1:] + depths[:-1])))
+    low, high = depths[k : k + 2].tolist()
+    reach = math.ceil(max(_blur(optics, z) for z in (low, high)) / optics.object_pitch) + 2
+    first, middle, last = (_column(optics, rung, z, reach) for z in (low, (low + high) / 2, high))
+    return float(0.5 * np.abs(middle - (first + last) / 2).sum(dtype=float))
 
 
 def _reach(optics: VolumeOptics, depth: float, lost: float) -> tuple[int, float]:
@@ -242,7 +268,7 @@ def unique_places(
 
 def _seconds(optics: VolumeOptics, plan: VolumePlan, rate: float) -> float:
     """Of one core that does so many products a second."""
-    places = len(unique_places(optics, plan.samples, plan.box))
+    places: float = len(unique_places(optics, plan.samples, plan.box))
     if plan.model == "ray":
         count = (plan.pixel_nodes * max(optics.pixels) + 1) ** 2
         per_plane = places * count * 4e-7

@@ -128,7 +128,10 @@ def build_stack(
             estimated=plan.error,
             model=plan.model,
             rung=plan.rung,
-            by_source={"light beyond the superpixels kept": max(plan.lost)},
+            by_source={
+                "light beyond the superpixels kept": max(plan.lost),
+                "halfway between planes": plan.between,
+            },
         ),
     )
 
@@ -147,7 +150,7 @@ def plane_kernels(
     lines = [plan.plane(o, number) for o in optics.lines]
     fine = tuple(n * plan.box for n in plan.samples)
     # voxels as well as places follow from a few
-    sums = dict.fromkeys(unique_places(optics, plan.samples, 1), np.float32(0))
+    wanted, sums = set(unique_places(optics, plan.samples, 1)), dict[tuple[int, int], np.ndarray]()
     for i, j in unique_places(optics, plan.samples, plan.box):
         places = [((k + 0.5) / n - 0.5) * optics.object_pitch for k, n in zip((i, j), fine)]
         column, entered = lines[0].column(*places)
@@ -158,8 +161,8 @@ def plane_kernels(
         _guard(optics, number, float(column.sum(dtype=float)), entered, plan)
         for (a, b), image in _images((i, j), column, fine, optics).items():
             voxel = a // plan.box, b // plan.box
-            if voxel in sums:
-                sums[voxel] = sums[voxel] + image
+            if voxel in wanted:
+                sums[voxel] = sums.get(voxel, 0) + image
     kept = near(plan.reach[number])
     offsets = np.argwhere(kept) - plan.reach[number]
     kernels = np.empty((len(offsets), *optics.pixels, *plan.samples), np.float32)

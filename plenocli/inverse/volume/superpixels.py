@@ -94,7 +94,17 @@ def white_superpixel(calibration: Calibration, shape: tuple[int, int]) -> np.nda
 
 
 def _step(calibration: Calibration, shape: tuple[int, int]) -> tuple[float, float]:
-    """Pixels of the sensor between those of the kernels (rows, columns)."""
+    """Pixels of the sensor between those of the kernels (rows, columns).
+
+    Raises InputError for another lattice than a square one.
+    """
+    if calibration.grid.lattice != "square":
+        raise InputError(
+            f"holds a {calibration.grid.lattice} lattice of lenslets; volumes are computed behind "
+            "square lenslets on a square one",
+            "calibration",
+            "demux such a capture, or take an array of square lenslets",
+        )
     rows, columns = (float(p) / n for p, n in zip(calibration.grid.pitch, shape))
     return rows, columns
 

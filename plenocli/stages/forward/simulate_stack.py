@@ -30,6 +30,7 @@ class StackSummary:
     planes: how many; samples: voxels of a lenslet.
     reach: superpixels on each side, least and most.
     light_lost: largest share of a point's light beyond them.
+    between_planes: share of a point's light elsewhere, halfway between planes, than interpolated.
     considered: rungs that were tried, with their errors.
     seconds, nominal_seconds: of one core, of this machine and at nominal rates, as planned.
     """
@@ -42,6 +43,7 @@ class StackSummary:
     estimated_accuracy: float
     reach: tuple[int, int]
     light_lost: float
+    between_planes: float
     considered: tuple[tuple[str, float], ...]
     seconds: float
     nominal_seconds: float
@@ -58,6 +60,7 @@ class StackSummary:
             "estimated_accuracy": self.estimated_accuracy,
             "reach": list(self.reach),
             "light_lost": self.light_lost,
+            "between_planes": self.between_planes,
             "considered": [list(one) for one in self.considered],
             "seconds": self.seconds,
             "bytes": self.bytes,
@@ -73,6 +76,8 @@ class StackSummary:
             f"{least} to {most} lenslets on each side ({self.light_lost:.1%} or less beyond them); "
             f"{self.rung}, {self.estimated_accuracy:.1g} of a voxel's light is elsewhere"
         )
+        if self.between_planes:
+            text += f"; halfway between planes {self.between_planes:.2g} is elsewhere than between theirs"
         if self.output is not None:
             return f"{Path(self.output)}: {text}"
         tried = ", ".join(f"{name} {error:.1g}" for name, error in self.considered)
@@ -205,6 +210,7 @@ def _summary(output: str | None, plan: VolumePlan) -> StackSummary:
         estimated_accuracy=plan.error,
         reach=(min(plan.reach), max(plan.reach)),
         light_lost=max(plan.lost),
+        between_planes=plan.between,
         considered=plan.considered,
         seconds=plan.seconds,
         nominal_seconds=plan.nominal_seconds,

@@ -47,7 +47,7 @@ def elsewhere(found, truth):
 
 
 @cache
-def brute_force(optics, depth, place, phase=None, nodes=72):
+def brute_force(optics, depth, place, phase=None, nodes=72, lenslets=9):
     """The column by brute force over 4 lenslets on each side."""
     camera = CAMERA | {
         "index": optics.index,
@@ -59,7 +59,7 @@ def brute_force(optics, depth, place, phase=None, nodes=72):
         place,
         depth,
         camera=camera,
-        lenslets=9,
+        lenslets=lenslets,
         reach=4,
         lenslet_nodes=nodes,
         pixel_nodes=9,
@@ -184,6 +184,27 @@ def test_all_light_is_on_the_superpixels_or_said_to_be_lost():
     for energy, lost in zip(stack.column_energy, plan.lost):
         assert energy.max() <= 1 + 1e-3
         assert 1 - energy.min() < 1.2 * lost + 5e-3
+
+
+def test_what_is_halfway_between_planes_is_as_far_from_their_mean_as_brute_force_says():
+    said = plan_volume(OPTICS, (3, 3), accuracy=1e-3, model="fresnel").between
+    place = 0.31 * OPTICS.object_pitch, 0.17 * OPTICS.object_pitch
+    low, middle, high = (
+        brute_force(OPTICS, depth, place, nodes=48, lenslets=5) for depth in (0.0, 1.5e-6, 3e-6)
+    )
+    assert said == pytest.approx(elsewhere(middle, (low + high) / 2), rel=0.03)
+    assert said > 0.05
+    one = replace(OPTICS, depths=(0.0,), places=(0.0,), scales=(1.0,))
+    assert plan_volume(one, (3, 3), accuracy=3e-2).between == 0
+
+
+def test_a_point_on_the_diagonal_lights_what_one_beside_it_does():
+    """Half of its light is computed, the rest is that transposed."""
+    settings = WaveSettings(neighbours=3, pixel_nodes=4, terms=22, reach=5)
+    plane = WavePlane(OPTICS, 3e-6, settings)
+    on, _ = plane.column(0.4e-6, 0.4e-6)
+    beside, _ = plane.column(0.4e-6, 0.4e-6 + 1e-16)
+    assert np.abs(on - beside).max() < 1e-5 * on.max()
 
 
 def test_rays_put_light_where_waves_do_but_for_diffraction():

@@ -57,7 +57,6 @@ class VolumePlan:
     seconds, nominal_seconds: of one core of this machine, and of one at the nominal rate.
     bytes: of the kernels.
     considered: (rung, error) of all that were tried.
-    between: share of a point's light that is elsewhere halfway between planes than interpolated.
     """
 
     model: str
@@ -74,7 +73,6 @@ class VolumePlan:
     nominal_seconds: float
     bytes: int
     considered: tuple[tuple[str, float], ...]
-    between: float
 
     @property
     def rung(self) -> str:
@@ -160,7 +158,6 @@ def plan_volume(
         * math.prod(samples)
         * sum(int(near(r).sum()) for r in reach),
         considered=tuple(considered),
-        between=_between(optics, (nodes, neighbours)),
     )
     return replace(
         plan,
@@ -214,7 +211,7 @@ def _column(optics: VolumeOptics, rung: tuple[int, int], depth: float, reach: in
     return WavePlane(optics, depth, settings).column(*place)[0]
 
 
-def _between(optics: VolumeOptics, rung: tuple[int, int]) -> float:
+def between_planes(optics: VolumeOptics, plan: VolumePlan) -> float:
     """Share of a point's light that is elsewhere, halfway between the planes nearest to the focus,
     than what is between those planes' light: there it changes most. 0 of one plane.
     """
@@ -224,6 +221,7 @@ def _between(optics: VolumeOptics, rung: tuple[int, int]) -> float:
     k = int(np.argmin(np.abs(depths[1:] + depths[:-1])))
     low, high = depths[k : k + 2].tolist()
     reach = math.ceil(max(_blur(optics, z) for z in (low, high)) / optics.object_pitch) + 2
+    rung = plan.pixel_nodes, plan.neighbours
     first, middle, last = (_column(optics, rung, z, reach) for z in (low, (low + high) / 2, high))
     return float(0.5 * np.abs(middle - (first + last) / 2).sum(dtype=float))
 

@@ -14,7 +14,7 @@ from plenocli.base.budget import budget, spread
 from plenocli.base.errors import NumericsError
 from plenocli.forward.propagation.accuracy_record import AccuracyRecord
 from plenocli.forward.volume.optics import VolumeOptics
-from plenocli.forward.volume.plan import VolumePlan, unique_places
+from plenocli.forward.volume.plan import VolumePlan, between_planes, unique_places
 from plenocli.forward.volume.waves import near
 
 SUM_SLACK = 5e-3
@@ -130,7 +130,7 @@ def build_stack(
             rung=plan.rung,
             by_source={
                 "light beyond the superpixels kept": max(plan.lost),
-                "halfway between planes": plan.between,
+                "halfway between planes": between_planes(optics, plan),
             },
         ),
     )

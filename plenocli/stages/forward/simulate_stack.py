@@ -77,7 +77,7 @@ class StackSummary:
             f"{self.rung}, {self.estimated_accuracy:.1g} of a voxel's light is elsewhere"
         )
         if self.between_planes:
-            text += f"; halfway between planes {self.between_planes:.2g} is elsewhere than between theirs"
+            text += f"; halfway between planes {self.between_planes:.2g} than between theirs"
         if self.output is not None:
             return f"{Path(self.output)}: {text}"
         tried = ", ".join(f"{name} {error:.1g}" for name, error in self.considered)
@@ -139,7 +139,7 @@ def run_simulate_stack(
         )
     plan = planned(optics, samples, accuracy, model)
     if explain or output is None:
-        return _summary(None, plan)
+        return _summary(None, optics, plan)
     if plan.seconds > LONG:
         note(f"about {plan.seconds:.2g} s on one core for {len(plan.reach)} planes ({plan.rung})")
     with (
@@ -154,7 +154,7 @@ def run_simulate_stack(
         accuracy=stack.accuracy.as_json(),
     )
     write_artefact(output, stack_artefact(stack, provenance), overwrite=overwrite)
-    return _summary(str(output), plan)
+    return _summary(str(output), optics, plan)
 
 
 def _with_measured_pupil(microscope: Microscope, calibration: Path | str) -> Microscope:
@@ -200,7 +200,9 @@ def planned(
     )
 
 
-def _summary(output: str | None, plan: VolumePlan) -> StackSummary:
+def _summary(output: str | None, optics: VolumeOptics, plan: VolumePlan) -> StackSummary:
+    from plenocli.forward.volume.plan import between_planes
+
     return StackSummary(
         output=output,
         planes=len(plan.reach),
@@ -210,7 +212,7 @@ def _summary(output: str | None, plan: VolumePlan) -> StackSummary:
         estimated_accuracy=plan.error,
         reach=(min(plan.reach), max(plan.reach)),
         light_lost=max(plan.lost),
-        between_planes=plan.between,
+        between_planes=between_planes(optics, plan),
         considered=plan.considered,
         seconds=plan.seconds,
         nominal_seconds=plan.nominal_seconds,

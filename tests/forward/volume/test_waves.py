@@ -10,7 +10,7 @@ from plenocli.base.errors import NumericsError
 from plenocli.base.linear_maps import BlockToeplitz
 from plenocli.forward.volume.optics import Term, VolumeOptics
 from plenocli.forward.volume.phantoms import PHANTOMS, Region, phantom
-from plenocli.forward.volume.plan import plan_volume
+from plenocli.forward.volume.plan import between_planes, plan_volume
 from plenocli.forward.volume.rays import RayPlane
 from plenocli.forward.volume.recording import finer, record
 from plenocli.forward.volume.stack import build_stack
@@ -187,7 +187,7 @@ def test_all_light_is_on_the_superpixels_or_said_to_be_lost():
 
 
 def test_what_is_halfway_between_planes_is_as_far_from_their_mean_as_brute_force_says():
-    said = plan_volume(OPTICS, (3, 3), accuracy=1e-3, model="fresnel").between
+    said = between_planes(OPTICS, plan_volume(OPTICS, (3, 3), accuracy=1e-3, model="fresnel"))
     place = 0.31 * OPTICS.object_pitch, 0.17 * OPTICS.object_pitch
     low, middle, high = (
         brute_force(OPTICS, depth, place, nodes=48, lenslets=5) for depth in (0.0, 1.5e-6, 3e-6)
@@ -195,7 +195,7 @@ def test_what_is_halfway_between_planes_is_as_far_from_their_mean_as_brute_force
     assert said == pytest.approx(elsewhere(middle, (low + high) / 2), rel=0.03)
     assert said > 0.05
     one = replace(OPTICS, depths=(0.0,), places=(0.0,), scales=(1.0,))
-    assert plan_volume(one, (3, 3), accuracy=3e-2).between == 0
+    assert between_planes(one, plan_volume(one, (3, 3), accuracy=3e-2)) == 0
 
 
 def test_a_point_on_the_diagonal_lights_what_one_beside_it_does():

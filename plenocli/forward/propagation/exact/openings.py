@@ -17,7 +17,7 @@ docs/model.md, "Exact propagation".
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import product
@@ -70,7 +70,7 @@ class OpeningBand(BandPlan):
     a lenslet and a superpixel.
 
     kernel_cut: root mean square that may be left out of the kernel;
-    kernel_terms: products that the kernel of an isolated lenslet takes.
+    kernel_terms: products that the kernel takes, from the lenslet that is farthest.
     """
 
     kernel_cut: float
@@ -115,7 +115,7 @@ def opening_band(
     cut = KERNEL_CUT * accuracy * base.faintest
     parabolic = camera.lenslet_array.profile == "parabolic"
     pairs = {pair for _, pair in _pairs(geometry, superpixels, base.window)}
-    own = _residual(geometry, _offset(geometry, (0.0, 0.0), (0.0, 0.0)), cut)
+    own, far = _nearest_and_farthest(geometry, pairs, cut)
     return OpeningBand(
         **vars(base)
         | {
@@ -123,7 +123,7 @@ def opening_band(
             "sampling": math.hypot(base.sampling, moved, own.lost / dim),
         },
         kernel_cut=cut,
-        kernel_terms=len(own.core),
+        kernel_terms=len(far.core),
     )
 
 
@@ -306,6 +306,16 @@ def _pairs(
             yield place, (_offset(geometry, place, lenslet), lenslet)
 
 
+def _nearest_and_farthest(
+    geometry: Geometry, pairs: Collection[tuple[Place, Place]], cut: float
+) -> tuple[Residual, Residual]:
+    """Residuals of a lenslet's own superpixel and of the pair (offset, lenslet) farthest apart."""
+    far = max(math.hypot(*offset) for offset, _ in pairs)
+    farthest = min(offset for offset, _ in pairs if math.hypot(*offset) >= far)
+    own = _offset(geometry, (0.0, 0.0), (0.0, 0.0))
+    return _residual(geometry, own, cut), _residual(geometry, farthest, cut)
+
+
 def _offset(geometry: Geometry, place: Place, lenslet: Place) -> Place:
     """From a lenslet to the centre of the superpixel at `place` (both in pitches): (rows, columns)
     m.
@@ -358,10 +368,13 @@ def features(
     """What a matrix consists of, as Model.features."""
     assert isinstance(band, OpeningBand)
     g, superpixels, oblique = geometry, superpixels_of(shape[1]), geometry.chief != (0.0, 0.0)
-    parabolic, r = camera.lenslet_array.profile == "parabolic", band.kernel_terms
+    parabolic = camera.lenslet_array.profile == "parabolic"
     lit = columns(camera, g, shape) / shape[1]
     tall, wide = (n * band.pixel_nodes for n in g.pixel_shape)
-    nodes = np.array([_count(g, parabolic, *p) for _, p in _pairs(g, superpixels, band.window)])
+    all_pairs = [pair for _, pair in _pairs(g, superpixels, band.window)]
+    nodes = np.array([_count(g, parabolic, *pair) for pair in all_pairs])
+    # the kernel's products are fewer for lenslets that are near
+    r = (len(_nearest_and_farthest(g, all_pairs, band.kernel_cut)[0].core) + band.kernel_terms) / 2
     made = 1.0  # share of superpixels that symmetry does not give
     if not oblique:
         flip_rows, flip_columns, turned = expected_symmetry(camera, g, shape)
@@ -396,7 +409,7 @@ def features(
         (
             {
                 "process": 1.0,
-                "kernels": item * r * most * (tall + wide),
+                "kernels": item * band.kernel_terms * most * (tall + wide),
                 "fields": item * lines * (most**2 + 2 * most * terms),
                 "spread": 16 * (orders * band.psf_nodes) ** 2,
                 "sensor": item * tall * wide * max(min(lit / parts, TOGETHER / tall / wide), 1),

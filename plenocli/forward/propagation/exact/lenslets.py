@@ -1,17 +1,8 @@
 """Sensor fields behind square lenslets by the exact scalar kernel: Rayleigh and Sommerfeld's first
-integral as low rank.
-
-The field on superpixel s of point (xp, yp) is M[(u, xp), (v, yp)], u and v on nodes of the sensor,
-or of an isolated lenslet as prolate functions across the superpixel (exact.prolate), which are
-fewer. The kernel's path along each axis, the lens and the curvature of h separate; the rest is the
-short sum of residual.Residuals, and so is h (debye.spherical_field), hence
-
-    M = sum over lenslets m, n of X_m (C_mn (x) S_mn) X_n^T,
-    X_m[(u, xp), (r, i)] = integral of W_m(u, x) P_r(u, x) e_i(m D2 + x - xp) dx.
-
-Terms (r, i) that all couplings leave too weak to matter are left out, and M is compressed to its
-own rank (low_rank_product): what is left are factor tables as the paraxial model has
-them (separable_fields).
+integral as low rank. The kernel's residual (residual.Residual) and the main lens's field are short
+sums of products, and so is the field M[(u, xp), (v, yp)] of all points of a superpixel, compressed
+to its own rank (low_rank_product): factor tables as the paraxial model has them (separable_fields).
+docs/model.md, "Exact propagation".
 """
 
 from __future__ import annotations

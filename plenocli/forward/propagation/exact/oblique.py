@@ -1,21 +1,7 @@
-"""The main lens's field on a lenslet off the axis, in direction cosines about its chief ray.
-
-From the pupil point xi to the place C + x on the array (C the lenslet's centre) the path is that of
-the chief ray to C + x, which is kept exactly (lenslets.py, openings.py), and what goes with the
-pupil point: with the direction cosines s of the way to C, ds = s - s0 from the chief ray's,
-
-    psi(xi; x) = ds.x + G(xi; x).
-
-The field of the point imaged at C + p is the integral of P exp(j k [psi(xi; p + d) - psi(xi; p)]),
-d = x - p: of one wave for each ds, and E = j k [G(xi; p + d) - G(xi; p)], with the logarithm of how
-much stronger the wave is, a slow function of ds. E is fitted by a polynomial of ds, exp E follows
-as a power series, and each power's integral is one product of waves,
-
-    F(d; p) = sum_ab e_ab(d; p) h_ab(d),   h_ab = integral of P ds_y^a ds_x^b exp(j k ds.d).
-
-F is computed for Gauss-Legendre nodes of p over the lenslet, out of focus each with the two spheres
-of its point, and is a polynomial of p between them. All nodes together are one matrix, whose
-singular vectors are functions of d and p along either axis.
+"""The main lens's field on a lenslet off the axis, in direction cosines about its chief ray, which
+is kept exactly (lenslets.py, openings.py): F(d; p) = sum_ab e_ab(d; p) h_ab(d), d from the point
+imaged at p, ds the direction cosines less the chief ray's, h_ab the waves of P ds_y^a ds_x^b, and
+e_ab the power series of exp E, what of the path is not linear in ds.
 docs/model.md, "Exact propagation".
 """
 

@@ -1,16 +1,9 @@
 """Sensor fields behind lenslets of any shape, anywhere on the array and with their neighbours, by
-the exact scalar kernel.
+the exact scalar kernel: with opening weights W on nodes of the rectangle around a lenslet and the
+kernel as a short sum of products (residual.Residual), the field of a point is
 
-What is summed over an opening is smooth beyond it, up to the rectangle around it. On Gauss-Legendre
-nodes y_i, x_j of that rectangle, which carry it, quadrature.opening_weights W_ij integrate over the
-opening; the lens, the main lens's wave and its field stand there as they are. Only the way to the
-sensor has to be a short sum of products (residual.Residual), so that the field of a point is
+    U(v, u) = sum over lenslets and terms r of [P_r(v, y_i)] [W_ij L_ij h_ij] [Q_r(u, x_j)]^T.
 
-    U(v, u) = sum over lenslets and terms r of [P_r(v, y_i)] [W_ij L_ij h_ij] [Q_r(u, x_j)]^T,
-
-two matrix products a point. Nothing is expanded about a lenslet's symmetry: openings of any shape,
-pupils that are not the same in all directions, cones that come aslant and coherent neighbours cost
-more nodes and terms, not another method.
 docs/model.md, "Exact propagation".
 """
 

@@ -1,18 +1,10 @@
-"""What is left of an exact kernel when its separable part is taken out, as a short sum of products.
-
-Rayleigh and Sommerfeld's first kernel from the array to the sensor (docs/model.md,
-"Exact propagation") is
-
-    K = z/(j lambda R^2) (1 + j/(k R)) exp(j k (R - z)) = exp(j k phi(dy)) exp(j k phi'(dx))
-        kappa(dy, dx)/(j lambda z),
-
-R^2 = z^2 + dy^2 + dx^2. From a lenslet to a superpixel whose centre is displaced by (cy, cx) from
-the lenslet's, phi and phi' are the exact paths along the lines dx = cx and dy = cy (`path`), so
-that kappa has only what the two axes do together: about the phase k cy cx (dy - cy) (dx - cx)/R^3
-between far ones and -k dx^2 dy^2/(4 z^3) to the lenslet's own superpixel. A lens of hyperbolic
-profile leaves an ell(y, x) of the same form. Their product on all displacements d = c + u - x is
+"""What is left of an exact kernel, from a lenslet to a superpixel displaced by (cy, cx) from it,
+when its separable part is taken out: kappa, what the two axes do together. With the same of a
+hyperbolic lens, on all displacements d = c + u - x,
 
     kappa(dy, dx) ell(y, x) = sum_rs P_r(u_y, y) C_rs Q_s(u_x, x).
+
+docs/model.md, "Exact propagation".
 """
 
 from __future__ import annotations

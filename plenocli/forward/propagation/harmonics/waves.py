@@ -1,19 +1,10 @@
-"""What a lenslet makes of one cone of the main lens's waves, by harmonics.
-
-With points at (r, phi), the lenslet's places (q, alpha) and the sensor's (rho, theta) about the
-lenslet's axis, the main lens's field is a sum over cones of direction sines s (debye.radial_waves)
-
-    h = sum over s of w J0(k s |x - xp|)
-      = sum over s and m of w J_m(k s q) J_m(k s r) e^(jm(alpha - phi)),
-
-and the way to the sensor couples equal m only:
+"""What a lenslet makes of one cone of the main lens's waves, by harmonics: with points at (r, phi)
+and the sensor's places (rho, theta) about the lenslet's axis,
 
     U(rho, theta) = sum over m of e^(jm(theta - phi)) sum over s of G_m(rho, s) w J_m(k s r),
     G_m(rho, s) = integral from 0 to the rim of K_m(rho, q) T(q) J_m(k s q) q dq,
-    K_m(rho, q) = integral over a turn of K(sqrt(rho^2 + q^2 - 2 rho q cos t)) cos(m t) dt,
 
-K being Rayleigh and Sommerfeld's kernel and T the lenslet with the curvature of h. Kernel and sum
-are exact; U_-m = U_m.
+K_m the harmonics of Rayleigh and Sommerfeld's kernel and T the lenslet with the curvature of h.
 docs/model.md, "Exact propagation".
 """
 

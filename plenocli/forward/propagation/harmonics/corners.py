@@ -1,14 +1,9 @@
-"""What a hexagonal lenslet has beyond its inscribed circle.
+"""What a hexagonal lenslet has beyond its inscribed circle: of a circle of radius q = a/cos t it
+keeps the directions farther than t from the middles of its six sides, whose harmonics c_6l couple
+those of the main lens's field,
 
-There the opening keeps, of a circle of radius q = a/cos t (a the inscribed one's, 0 <= t <= 30
-degrees), the directions farther than t from the middles of the six sides. As a function of the
-angle it has the harmonics c_0 = 1 - 6 t/pi and c_6l = -sin(6 l t)/(pi l), and couples those of the
-main lens's field, h_n = sum over s of w J_n(k s q) J_n(k s r):
+    E_m(q) = sum over l of c_6l h_(m - 6l) e^(-j(m - 6l) phi).
 
-    E_m(q) = sum over l of c_6l h_(m - 6l) e^(-j(m - 6l) phi),
-    U_m(rho) = (inscribed circle) + integral of K_m(rho, q) T(q) E_m(q) q dq,
-
-in which dq = a sin t/cos^2 t dt takes the root at the inscribed circle away.
 docs/model.md, "Exact propagation".
 """
 

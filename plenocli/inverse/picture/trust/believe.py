@@ -51,10 +51,6 @@ SURE, HINT = 4.0, 2.5
 moved, speaks against the matrix by itself, and from which on beside a picture that may not go on
 across borders.
 """
-JUMPING = 6.0
-"""Standard deviations of even light that moved, up to which jumps may be the scene's: five stars
-before a right matrix have 4.6.
-"""
 CHANCE = 1.0
 """Standard deviations of chance that a factor is allowed where nothing else is found, and that are
 taken off where the matrix is not believed.
@@ -145,7 +141,7 @@ def believe(
         first is not None
         and not continuous
         and quiet
-        and even <= JUMPING
+        and even <= SURE
         and _scene_jumps(svd, lmmse, stacked, level, first)
     )
     if not found and (continuous or rough):

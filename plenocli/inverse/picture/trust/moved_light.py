@@ -24,6 +24,10 @@ from which on that may be a scene in step with the lenslets (0.04 and more).
 """
 
 
+FEW = 5
+"""Bright lenslets that are too few for their scatter to tell chance."""
+
+
 def moved_rest(system: LensletMatrix, svd: Svd, lmmse: Lmmse, y: np.ndarray, sigma: float) -> float:
     """How far what no object gives is what the estimate would show if it moved, in standard
     deviations of chance.
@@ -68,7 +72,8 @@ def moved_even_light(
     nothing = np.zeros(len(y)), 0.0
     w, bright = lmmse.analysis @ y, lmmse.brightness(y)
     power = float(bright @ bright)
-    if min(*system.pixel_shape, *system.object_shape) < 2 or not power > 0:
+    few = not power**2 > FEW * float(np.sum(bright**4))
+    if min(*system.pixel_shape, *system.object_shape) < 2 or few:
         return nothing
     found = w @ bright / power
     deviation = np.sqrt((w - np.outer(found, bright)) ** 2 @ bright**2) / power

@@ -2,6 +2,7 @@
 
 import shlex
 import shutil
+from fnmatch import fnmatch
 from pathlib import Path
 
 import click
@@ -135,17 +136,17 @@ S -125 97
 SI 0 0
 GO
 """
-MADE = (
-    "calibrate --white white.png --dark dark.png -o grid.h5",
-    "calibrate --white white.dng --dark dark.dng -o white-only.h5",
-    "simulate-pif fine.toml --superpixels 1x1 --coherent-ring 0 -o pif-fine.h5",
-    "learn-dict --pif pif.h5 --iterations 1 -o learnt.h5",
-    "refocus capture.h5 --camera camera.toml --planes 3 -o distances.h5",
-    "capture-sim colour.toml --model ray --superpixels 1x1 --scene paints.csv -o shown.h5",
-    "demux shown.h5 --calibration predicted.h5 -o shown-spectra.h5",
-    "seal runs/demo",
-)
-"""Files of `kit` beside those of stages."""
+MADE = {
+    "grid.h5": "calibrate --white white.png --dark dark.png -o grid.h5",
+    "white-only.h5": "calibrate --white white.dng --dark dark.dng -o white-only.h5",
+    "pif-fine.h5": "simulate-pif fine.toml --superpixels 1x1 --coherent-ring 0 -o pif-fine.h5",
+    "learnt.h5": "learn-dict --pif pif.h5 --iterations 1 -o learnt.h5",
+    "distances.h5": "refocus capture.h5 --camera camera.toml --planes 3 -o distances.h5",
+    "shown.h5": "capture-sim colour.toml --model ray --superpixels 1x1 --scene paints.csv"
+    " -o shown.h5",
+    "shown-spectra.h5": "demux shown.h5 --calibration predicted.h5 -o shown-spectra.h5",
+}
+"""Files of `kit` beside those of stages, made when an example wants them."""
 FOLDERS = {
     "sample_configs/": "sample_configs",
     "colorchecker captures": "painted",
@@ -190,9 +191,7 @@ def kit(stages, runner, tmp_path_factory):
     (folder / "runs" / "demo").mkdir(parents=True)
     for name in ("image.h5", "capture.h5", "score.json"):
         shutil.copy(folder / name, folder / "runs" / "demo")
-    for line in MADE:
-        outcome = runner.run(line.split(), folder, limit=120)
-        assert outcome.code == 0, outcome.text
+    _run(runner, "seal runs/demo", folder)
     sweeps = folder / "sample_configs" / "sweeps"
     sweeps.mkdir(parents=True)
     for name in ("lenslets", "filters"):
@@ -201,6 +200,28 @@ def kit(stages, runner, tmp_path_factory):
         shutil.copy(folder / "camera.toml", sweeps / name)
         shutil.copy(folder / "camera.toml", folder / "sample_configs" / name)
     return folder
+
+
+def _run(runner, line, folder):
+    outcome = runner.run(line.split(), folder, limit=120)
+    assert outcome.code == 0, outcome.text
+
+
+def _provided(runner, kit, name):
+    """A file of `kit`."""
+    if name in MADE and not (kit / name).exists():
+        for other in MADE[name].split()[:-1]:
+            _provided(runner, kit, other)
+        _run(runner, MADE[name], kit)
+    return kit / name
+
+
+def _named(line, name):
+    """Whether an example's words name a file, alone, in a folder or by a pattern."""
+    return any(
+        name in word or fnmatch(name, word) or name.startswith(f"{word.rstrip('/')}/")
+        for word in line
+    )
 
 
 def _save_png(source, target):
@@ -234,8 +255,9 @@ def test_an_example_runs(line, kit, runner, tmp_path):
         if " ".join(line).startswith(beginning):
             names |= others
     for name, source in names.items():
-        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy(kit / source, tmp_path / name)
+        if _named(line, name):
+            (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(_provided(runner, kit, source), tmp_path / name)
     written = line[line.index("-o") + 1] if "-o" in line else None
     if written and "--resume" not in line:
         (tmp_path / written).unlink(missing_ok=True)

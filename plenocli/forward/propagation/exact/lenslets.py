@@ -47,9 +47,9 @@ if TYPE_CHECKING:
     from plenocli.forward.propagation.exact.low_rank_product import Matrix
     from plenocli.forward.propagation.plan import PifPlan
 
-CUT, CUT_EFFECT = 0.42, 1.3
+CUT, CUT_EFFECT, MANY_CELLS = 0.42, 1.3, 15.0
 """Root-energy cut of the field over the accuracy asked for, and its effect on the worst column
-over itself (measured: 0.5 to 2.3).
+over itself (measured: 0.5 to 2.3), from so many diffraction cells on.
 """
 
 SIDES = 0.35
@@ -82,6 +82,7 @@ def exact_band(
     # edges are all that columns of points beside a lenslet have
     cut = max(LEAST, cut * base.faintest)
     missed = CUT_EFFECT * max(CUT * accuracy, cut / base.faintest)
+    missed *= math.sqrt(min(1.0, geometry.diffraction_cells / MANY_CELLS))
     count = prolate_count(_bandwidth(geometry, superpixels), cut / 100)
     count = (
         count

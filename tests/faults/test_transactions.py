@@ -86,7 +86,7 @@ def test_of_a_failure_all_results_stay_as_they_were(runner, folder, campaign, co
         "replace",
         *(
             pytest.param(name, marks=pytest.mark.slow)
-            for name in ("fsync", "unlink", "link", "open", "write", "pwrite", "close")
+            for name in ("fsync", "unlink", "link", "open", "write", "pwrite")
         ),
     ],
 )

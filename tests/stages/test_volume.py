@@ -71,7 +71,7 @@ def test_the_kernels_of_a_microscope_are_read_as_they_were_written(camera, tmp_p
 
 def test_a_plan_of_a_volume_writes_nothing(camera, tmp_path):
     report = run_simulate_pif(camera, None, Settings(), explain=True)
-    assert report.output is None and "waves" in report.line() and report.seconds > 0
+    assert report.output is None and "waves" in report.line() and report.plan.seconds > 0
     assert "halfway between planes" in report.line()
 
 

@@ -10,10 +10,9 @@ import numpy as np
 from plenocli.base.budget import budget
 from plenocli.base.linear_maps import BlockCirculant, torus_for
 from plenocli.forward.volume.optics import VolumeOptics
+from plenocli.forward.volume.phantoms import Sampler
 from plenocli.forward.volume.plan import BOX, VolumePlan, plan_volume
 from plenocli.forward.volume.stack import plane_kernels
-
-Sampler = Callable[[float, np.ndarray, np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True, kw_only=True)

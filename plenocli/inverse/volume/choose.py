@@ -8,8 +8,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 
-import numpy as np
-
 from plenocli.base.errors import NumericsError
 from plenocli.base.progress import bar
 from plenocli.inverse.volume.lmmse import is_uneven, lmmse
@@ -51,8 +49,9 @@ def volume_of(problem: Problem, method: str = "auto") -> Volume:
     best, tried = None, []
     for name in COMPARED:
         found = SOLVERS[name](problem)
-        tried.append(Trial(name, _misfit(problem, found)))
-        if tried[-1].misfit <= min(trial.misfit for trial in tried):
+        assert found.held_out is not None
+        tried.append(Trial(name, 10 ** (-found.held_out.explained_db / 10)))
+        if not tried[-1].misfit > min(trial.misfit for trial in tried):
             best = found
     assert best is not None
     return replace(best, trace=(*tried, *best.trace))
@@ -64,14 +63,6 @@ def volume_like(problem: Problem, other: Volume) -> Volume:
     """
     linear = {} if other.sigma is None else {"uneven": is_uneven(other.value)}
     return SOLVERS[other.method](problem, **linear)
-
-
-def _misfit(problem: Problem, volume: Volume) -> float:
-    held = volume.held_out
-    assert held is not None
-    light = np.zeros(problem.signal.shape)
-    light[problem.held] = held.predicted - problem.measurement.offset[problem.held]
-    return problem.misfit(light)
 
 
 def supported_planes(
@@ -101,26 +92,15 @@ def supported_planes(
         if chosen and misfit(chosen | {found}) > (1 - WORTH) * misfit(chosen):
             break
         chosen = _exchanged(chosen | {found}, count, misfit)
-    trials = (Trial(f"planes {_named(key)}", value) for key, value in misfits.items())
+    trials = (Trial(f"planes {', '.join(map(str, key))}", value) for key, value in misfits.items())
     return sorted(chosen), tuple(trials)
 
 
 def _exchanged(chosen: set[int], count: int, misfit: Callable[[set[int]], float]) -> set[int]:
     """The planes after each has moved to a neighbour as long as that is better."""
-    better = True
-    while better:
-        better = False
-        for plane in sorted(chosen):
-            for near in (plane - 1, plane + 1):
-                moved = chosen - {plane} | {near}
-                if 0 <= near < count and len(moved) == len(chosen):
-                    if misfit(moved) < misfit(chosen):
-                        chosen, better = moved, True
-                        break
-            if better:
-                break
+    for plane in sorted(chosen):
+        for near in {plane - 1, plane + 1} & set(range(count)) - chosen:
+            moved = chosen - {plane} | {near}
+            if misfit(moved) < misfit(chosen):
+                return _exchanged(moved, count, misfit)
     return chosen
-
-
-def _named(planes: tuple[int, ...]) -> str:
-    return ", ".join(str(plane) for plane in planes)

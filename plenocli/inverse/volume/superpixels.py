@@ -100,8 +100,7 @@ def _step(calibration: Calibration, shape: tuple[int, int]) -> tuple[float, floa
     """
     if calibration.grid.lattice != "square":
         raise InputError(
-            f"holds a {calibration.grid.lattice} lattice of lenslets; volumes are computed behind "
-            "square lenslets on a square one",
+            f"holds a {calibration.grid.lattice} lattice; volumes are those of square lenslets",
             "calibration",
             "demux such a capture, or take an array of square lenslets",
         )

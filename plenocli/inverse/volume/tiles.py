@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -90,11 +91,9 @@ class Tiles:
                 if needed <= budget().memory:
                     least, best = rows * columns, (rows, columns)
         if not math.isfinite(least):
-            smallest = tuple(_size(n, n, halo) for n in count)
+            smallest = _size(count[0], count[0], halo), _size(count[1], count[1], halo)
             budget().require(
-                _needed(
-                    self.method, pixels, unknowns, torus_for((smallest[0], smallest[1]), reach)
-                ),
+                _needed(self.method, pixels, unknowns, torus_for(smallest, reach)),
                 f"the map of {smallest[0]} x {smallest[1]} lenslets",
                 self._where,
                 "take fewer planes or voxels",
@@ -132,16 +131,9 @@ class Tiles:
 
     def of(self, stack: Stack) -> Problem:
         """The brightest window before other kernels, the same pixels put aside."""
-        other = Tiles(
-            stack,
-            self.measurement,
-            self.method,
-            hold_out=self._hold_out,
-            seed=self._seed,
-            where=self._where,
-            device=self.device,
-        )
-        other.windows, other._draw = self.windows, self._draw
+        other = copy(self)
+        other.stack = stack
+        vars(other).pop("_op", None)  # of these kernels
         return other.problem(self.brightest)
 
     def without_haze(self) -> float:

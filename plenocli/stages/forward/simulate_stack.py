@@ -13,7 +13,6 @@ from plenocli.base.text import by
 if TYPE_CHECKING:
     from plenocli.forward.camera.microscope import Microscope
     from plenocli.forward.camera.model import Camera
-    from plenocli.forward.volume.optics import VolumeOptics
     from plenocli.forward.volume.plan import VolumePlan
 
 DEFAULT_ACCURACY = 5e-3
@@ -27,63 +26,50 @@ class StackSummary:
     """What simulate-pif planned, or wrote, for a volume.
 
     output: None for a plan.
-    planes: how many; samples: voxels of a lenslet.
-    reach: superpixels on each side, least and most.
-    light_lost: largest share of a point's light beyond them.
     between_planes: share of a point's light elsewhere, halfway between planes, than interpolated.
-    considered: rungs that were tried, with their errors.
-    seconds, nominal_seconds: of one core, of this machine and at nominal rates, as planned.
     """
 
     output: str | None
-    planes: int
-    samples: tuple[int, int]
-    rung: str
-    accuracy: float
-    estimated_accuracy: float
-    reach: tuple[int, int]
-    light_lost: float
+    plan: VolumePlan
     between_planes: float
-    considered: tuple[tuple[str, float], ...]
-    seconds: float
-    nominal_seconds: float
-    bytes: int
 
     def as_json(self) -> dict[str, Any]:
-        """The fields by name."""
+        """What is told, by name."""
+        plan = self.plan
         return {
             "output": self.output,
-            "planes": self.planes,
-            "samples": list(self.samples),
-            "rung": self.rung,
-            "accuracy": self.accuracy,
-            "estimated_accuracy": self.estimated_accuracy,
-            "reach": list(self.reach),
-            "light_lost": self.light_lost,
+            "planes": len(plan.reach),
+            "samples": list(plan.samples),
+            "rung": plan.rung,
+            "accuracy": plan.asked,
+            "estimated_accuracy": plan.error,
+            "reach": [min(plan.reach), max(plan.reach)],
+            "light_lost": max(plan.lost),
             "between_planes": self.between_planes,
-            "considered": [list(one) for one in self.considered],
-            "seconds": self.seconds,
-            "bytes": self.bytes,
+            "considered": [list(one) for one in plan.considered],
+            "seconds": plan.seconds,
+            "bytes": plan.bytes,
         }
 
     def line(self) -> str:
         """What people read: one sentence, or the plan."""
         from plenocli.base.memory import size_text
 
-        least, most = self.reach
+        plan = self.plan
         text = (
-            f"kernels of {self.planes} planes, {by(self.samples)} voxels a lenslet, light of "
-            f"{least} to {most} lenslets on each side ({self.light_lost:.1%} or less beyond them); "
-            f"{self.rung}, {self.estimated_accuracy:.1g} of a voxel's light is elsewhere"
+            f"kernels of {len(plan.reach)} planes, {by(plan.samples)} voxels a lenslet, light of "
+            f"{min(plan.reach)} to {max(plan.reach)} lenslets on each side "
+            f"({max(plan.lost):.1%} or less beyond them); "
+            f"{plan.rung}, {plan.error:.1g} of a voxel's light is elsewhere"
         )
         if self.between_planes:
             text += f"; halfway between planes {self.between_planes:.2g} than between theirs"
         if self.output is not None:
             return f"{Path(self.output)}: {text}"
-        tried = ", ".join(f"{name} {error:.1g}" for name, error in self.considered)
+        tried = ", ".join(f"{name} {error:.1g}" for name, error in plan.considered)
         return (
-            f"{text}\ntried: {tried}; asked {self.accuracy:g}\n"
-            f"about {self.seconds:.2g} s on one core, a file of {size_text(self.bytes)}"
+            f"{text}\ntried: {tried}; asked {plan.asked:g}\n"
+            f"about {plan.seconds:.2g} s on one core, a file of {size_text(plan.bytes)}"
         )
 
 
@@ -120,6 +106,7 @@ def run_simulate_stack(
     from plenocli.files.config.microscope_file import load_microscope, microscope_toml
     from plenocli.files.results.stacks import stack_artefact
     from plenocli.forward.volume.cameras import optics_of, optics_of_camera
+    from plenocli.forward.volume.plan import between_planes, plan_volume
     from plenocli.forward.volume.stack import build_stack
 
     if camera is None:
@@ -137,9 +124,17 @@ def run_simulate_stack(
             "--calibration",
             "leave it out",
         )
-    plan = planned(optics, samples, accuracy, model)
+    if model == "exact":
+        raise UsageError(
+            "volumes are computed by rays or by waves that are paraxial behind the lenslets",
+            "--model",
+            "take ray, fresnel or auto",
+        )
+    asked = DEFAULT_ACCURACY if accuracy is None else accuracy
+    plan = plan_volume(optics, samples, accuracy=asked, model=model)
+    between = between_planes(optics, plan)
     if explain or output is None:
-        return _summary(None, optics, plan)
+        return StackSummary(output=None, plan=plan, between_planes=between)
     if plan.seconds > LONG:
         note(f"about {plan.seconds:.2g} s on one core for {len(plan.reach)} planes ({plan.rung})")
     with (
@@ -154,7 +149,7 @@ def run_simulate_stack(
         accuracy=stack.accuracy.as_json(),
     )
     write_artefact(output, stack_artefact(stack, provenance), overwrite=overwrite)
-    return _summary(str(output), optics, plan)
+    return StackSummary(output=str(output), plan=plan, between_planes=between)
 
 
 def _with_measured_pupil(microscope: Microscope, calibration: Path | str) -> Microscope:
@@ -175,46 +170,3 @@ def _with_measured_pupil(microscope: Microscope, calibration: Path | str) -> Mic
         update={"rings": found.intensity, "numerical_aperture": found.aperture}
     )
     return microscope.model_copy(update={"objective": lens})
-
-
-def planned(
-    optics: VolumeOptics, samples: tuple[int, int], accuracy: float | None, model: str
-) -> VolumePlan:
-    """The plan of a volume with `samples` voxels (rows, columns) a lenslet.
-
-    Raises UsageError for a model that volumes do not have, NumericsError as plan_volume.
-    """
-    from plenocli.forward.volume.plan import plan_volume
-
-    if model == "exact":
-        raise UsageError(
-            "volumes are computed by rays or by waves that are paraxial behind the lenslets",
-            "--model",
-            "take ray, fresnel or auto",
-        )
-    return plan_volume(
-        optics,
-        samples,
-        accuracy=DEFAULT_ACCURACY if accuracy is None else accuracy,
-        model=model,
-    )
-
-
-def _summary(output: str | None, optics: VolumeOptics, plan: VolumePlan) -> StackSummary:
-    from plenocli.forward.volume.plan import between_planes
-
-    return StackSummary(
-        output=output,
-        planes=len(plan.reach),
-        samples=plan.samples,
-        rung=plan.rung,
-        accuracy=plan.asked,
-        estimated_accuracy=plan.error,
-        reach=(min(plan.reach), max(plan.reach)),
-        light_lost=max(plan.lost),
-        between_planes=between_planes(optics, plan),
-        considered=plan.considered,
-        seconds=plan.seconds,
-        nominal_seconds=plan.nominal_seconds,
-        bytes=plan.bytes,
-    )

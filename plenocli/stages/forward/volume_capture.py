@@ -249,7 +249,7 @@ def _layer(name: str, shape: tuple[int, int], sampling: str) -> Layer:
 def _shown(plan: VolumePlan) -> Iterator[Callable[[int], None]]:
     """Says how long it takes, where it is long, and shows the planes that are done."""
     if plan.seconds > LONG:
-        note(f"about {plan.seconds:.2g} s on one core for {len(plan.reach)} planes ({plan.rung})")
+        note(f"about {plan.seconds:.2g} s on one core: a larger --accuracy takes less")
     with bar(None, len(plan.reach), "planes") as shown:
         yield shown.update
 

@@ -242,9 +242,10 @@ def _simulate_pif(task: Task, folder: Path) -> MatrixCost:
         folder / "camera.toml", folder / "pif.h5", _settings(Settings, task.options("simulate-pif"))
     )
     assert isinstance(report, PifSummary | StackSummary)  # nothing was to be explained
+    cost = report.plan if isinstance(report, StackSummary) else report
     return MatrixCost(
-        matrix_seconds=report.nominal_seconds,
-        matrix_bytes=report.bytes,
+        matrix_seconds=cost.nominal_seconds,
+        matrix_bytes=cost.bytes,
         cpu_seconds=time.process_time() - start,
     )
 

@@ -51,7 +51,9 @@ def is_noise(value: np.ndarray, detail: np.ndarray, svd: Svd, sigma: float) -> b
     for x in value.reshape(-1, value.shape[-1]):
         seen = rows[:, x > 0]
         values = np.linalg.eigvalsh(seen.T @ seen)
-        left -= float(np.sum(1 / np.maximum(values, np.finfo(float).tiny)))
+        if len(values) and values[0] <= np.finfo(float).eps * values[-1]:
+            return True  # noise without a bound
+        left -= float(np.sum(1 / values))
         if left < 0:
             return True
     return False

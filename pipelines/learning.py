@@ -8,6 +8,7 @@ leaves it. Three minutes of CPU at 40x40 points.
 
 import csv
 import sys
+from io import StringIO
 from pathlib import Path
 
 import numpy as np
@@ -95,8 +96,6 @@ def main(pif, output, iterations="10"):
                 "dB over mirror images",
                 flush=True,
             )
-    from io import StringIO
-
     text = StringIO()
     csv.writer(text, lineterminator="\n").writerows([COLUMNS, *rows])
     publish(Path(output), text.getvalue().encode(), overwrite=True)

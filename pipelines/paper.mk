@@ -17,8 +17,10 @@ all: spatial spectral $(RUN)/learning.csv
 .PHONY: all spatial spectral
 
 # what learning gains on five photographs, iteration by iteration (three minutes of CPU)
-$(RUN)/learning.csv: spatial
-	@test -s $@ || python $(HERE)learning.py $(SPATIAL)/pif.h5 $@
+$(RUN)/learning.csv: $(SPATIAL)/pif.h5 $(HERE)learning.py
+	python $(HERE)learning.py $< $@
+
+$(SPATIAL)/pif.h5: spatial ;
 
 # non-negative least squares at several steps: the paper does not say where it stopped
 spatial:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from plenocli.base.errors import InputError
-from plenocli.files.artefacts.provenance import first_bytes
+from plenocli.files.artefacts.provenance import first_bytes, reading
 from plenocli.files.atomic import replacement, write_at
 
 SEAL = "plenocli sha256 " + 64 * "0"
@@ -53,16 +53,11 @@ def require_seal(path: str | os.PathLike) -> bool:
     head = first_bytes(path, _HEAD_BYTES)
     if _OURS not in head:
         return False
-    try:
-        with open(path, "rb") as stream:
-            # the name of an input may look like a seal, too
-            found = islice(_SEALS.finditer(head), 8)
-            if any(_digest(stream.fileno(), s.start(1)) == s[1] for s in found):
-                return True
-    except OSError as error:
-        raise InputError(
-            f"cannot be read ({error.strerror})", Path(path), "check the file and its permissions"
-        ) from None
+    with reading(path), open(path, "rb") as stream:
+        # the name of an input may look like a seal, too
+        found = islice(_SEALS.finditer(head), 8)
+        if any(_digest(stream.fileno(), s.start(1)) == s[1] for s in found):
+            return True
     raise InputError(
         "is damaged, was edited, or is of an older plenocli: it is not sealed as it stands",
         Path(path),

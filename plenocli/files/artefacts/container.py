@@ -31,7 +31,12 @@ from plenocli.base.text import utf8
 from plenocli.base.tiling import InParts
 from plenocli.files.artefacts import schema as tables
 from plenocli.files.artefacts.kinds import SCHEMAS
-from plenocli.files.artefacts.provenance import Provenance, first_bytes, require_file
+from plenocli.files.artefacts.provenance import (
+    Provenance,
+    first_bytes,
+    reading,
+    require_file,
+)
 from plenocli.files.artefacts.sparse import Behind, SparseFile
 from plenocli.files.artefacts.structure import (
     EMPTY_AXIS,
@@ -462,12 +467,8 @@ def _verified_bytes(path: Path) -> memoryview:
     if READING * size > budget().memory:
         _require_whole(path, first_bytes(path, 4096), size)
         budget().require_reading(path, READING * size)
-    try:
+    with reading(path):
         content = path.read_bytes()
-    except OSError as error:
-        raise InputError(
-            f"cannot be read ({error.strerror})", path, "check the file and its permissions"
-        ) from error
     digest = _require_whole(path, content[:4096], len(content))
     image = memoryview(content)[HEADER_BYTES:]
     if hashlib.sha256(image).hexdigest() != digest:

@@ -5,10 +5,11 @@ No clock, host, folder or user.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -118,21 +119,22 @@ def content_digest(path: str | os.PathLike) -> str:
 def file_digest(path: str | os.PathLike) -> str:
     """SHA-256 of a file's bytes, hex. Raises InputError."""
     require_file(path)
-    try:
-        with open(path, "rb") as stream:
-            return hashlib.file_digest(stream, "sha256").hexdigest()
-    except OSError as error:
-        raise InputError(
-            f"cannot be read ({error.strerror})", path, "check the file and its permissions"
-        ) from error
+    with reading(path), open(path, "rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
 def first_bytes(path: str | os.PathLike, count: int) -> bytes:
     """The first `count` bytes of a file, or all of a shorter one. Raises InputError."""
     require_file(path)
+    with reading(path), open(path, "rb") as stream:
+        return stream.read(count)
+
+
+@contextlib.contextmanager
+def reading(path: str | os.PathLike) -> Iterator[None]:
+    """OSError within the block becomes the InputError for a file."""
     try:
-        with open(path, "rb") as stream:
-            return stream.read(count)
+        yield
     except OSError as error:
         raise InputError(
             f"cannot be read ({error.strerror})", path, "check the file and its permissions"

@@ -160,13 +160,18 @@ def considered(plan: PifPlan) -> list[dict[str, Any]]:
     why not chosen; error by source, rings, seconds of one core of this machine, bytes at work, None
     where a model does not serve.
     """
-    return [
-        {"rung": c.name, "model": c.model, "chosen": c.why is None, "reason": c.why}
-        | {"error": known and c.error, "split": c.split, "coherent_ring": known and c.ring}
-        | {"seconds": known and seconds_here(c), "bytes": known and c.bytes}
-        for c in plan.candidates
-        for known in (None if c.split is None else True,)
-    ]
+    found: list[dict[str, Any]] = []
+    for c in plan.candidates:
+        numbers: dict[str, Any] = dict.fromkeys(
+            ("error", "split", "coherent_ring", "seconds", "bytes")
+        )
+        if c.split is not None:
+            known = c.error, c.split, c.ring, seconds_here(c), c.bytes
+            numbers = dict(zip(numbers, known, strict=True))
+        found.append(
+            {"rung": c.name, "model": c.model, "chosen": c.why is None, "reason": c.why} | numbers
+        )
+    return found
 
 
 def expectation(

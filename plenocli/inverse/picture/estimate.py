@@ -152,10 +152,8 @@ def estimate(
         found = replace(found, sigma=np.maximum(found.sigma, left))
     kept = 1.0
     if guard:
-        shape, svd = (
-            estimators.system.object_shape,
-            looked_through.svd if method.unrestrained else None,
-        )
+        shape = estimators.system.object_shape
+        svd = looked_through.svd if method.unrestrained else None
         found, kept = guarded(found, own, belief, shape, data.common, svd)
     if kept < 1 and belief.right and not estimators.coupled and found.sigma is not None:
         # what was drawn back is nearer to LMMSE, about which the truth lies, than what was found

@@ -110,10 +110,8 @@ def features(
     fine = math.prod(geometry.pixel_shape) * band.pixel_nodes**2
     mean = sum(kind.count * sizes.ranks[kind.aside] for kind in sizes.kinds) / sizes.tables
     # terms that go with the point, too
-    terms, orders = (
-        band.terms * (OBLIQUE_TERMS if oblique else 1),
-        orders_for(geometry, band.cut / 2),
-    )
+    terms = band.terms * (OBLIQUE_TERMS if oblique else 1)
+    orders = orders_for(geometry, band.cut / 2)
     rows = sizes.lit * terms * sizes.rows
     operations = {
         "interval_values": 4 * rows * sizes.across,

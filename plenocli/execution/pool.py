@@ -393,8 +393,9 @@ def _cluster(scheduler: str) -> Iterator[Any]:
         raise UsageError(
             "--scheduler needs Dask, which is not installed", fix=how_to_install("cluster")
         ) from error
-    # its tracebacks of a broken connection, of which we say what to do
-    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
+    # tracebacks of a broken connection, of which we say what to do
+    for name in ("distributed", "distributed.client", "tornado.application", "asyncio"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)
     address, security = _address(scheduler)
     try:
         client = Client(address, timeout="10s", security=security, set_as_default=False)

@@ -246,13 +246,14 @@ def _may_fork() -> bool:
 
 def _forked(theirs: socket.socket, memory: int) -> int:
     """Process id of a copy of this process that serves: nothing is started and imported anew."""
+    nowhere = os.open(os.devnull, os.O_RDWR)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # OpenBLAS's threads are not ours
         pid = os.fork()
     if pid:
+        os.close(nowhere)
         return pid
     try:
-        nowhere = os.open(os.devnull, os.O_RDWR)
         for stream in (0, 1, 2):
             os.dup2(nowhere, stream)
         for descriptor in map(int, os.listdir("/proc/self/fd")):

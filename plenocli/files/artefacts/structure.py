@@ -103,6 +103,8 @@ def no_hdf5(path: Name, error: Exception) -> Exception:
     """The error for what HDF5 says of a whole file: it does not say when it got no memory."""
     if not can_have(READING * os.path.getsize(path) + (1 << 20)):
         return MemoryError(str(error))
+    if isinstance(error, OSError) and error.errno:
+        return InputError(f"cannot be read ({error.strerror})", path, "check the disk")
     return InputError(
         f"cannot be parsed as HDF5 ({type(error).__name__}: {error})", path, "make it again"
     )

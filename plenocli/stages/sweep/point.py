@@ -7,6 +7,7 @@ measured stand apart.
 """
 
 import contextlib
+import errno
 import os
 import socket
 import tempfile
@@ -39,6 +40,8 @@ if TYPE_CHECKING:
 _SEEDS = {"white": 1_000_001, "classes": 2_000_001, "picture": 2_000_002}
 _DARK, _BAND = 1_000_002, 1_000_003
 """Seeds of the captures beside the first, over its seed: no two draw the same noise."""
+
+_MACHINE = (errno.EIO, errno.EAGAIN, errno.ENOMEM, errno.EMFILE, errno.ENFILE)
 
 
 def _require_files(job: Job) -> None:
@@ -107,10 +110,11 @@ def run_point(job: Job) -> PointResult:
             metrics = _CHAINS[job.task.chain](run)
             design = _design(folder / "camera.toml", run.cost)
             found = PointResult(metrics=design | run.light | metrics)
-        except OutputError:
-            raise
-        except PlenoError as error:
-            found = refused(_elsewhere(error, folder))
+        except PlenoError as caught:
+            error = _elsewhere(caught, folder)
+            if isinstance(error, OutputError):
+                raise error from None
+            found = refused(error)
         before = [
             *(job.matrix.cost.notes if job.matrix else ()),
             *(job.capture.notes if job.capture else ()),
@@ -197,8 +201,16 @@ class _Run:
 
 
 def _elsewhere(error: PlenoError, folder: Path) -> PlenoError:
-    """The error without the folder of this run, so that it reads the same wherever it happened."""
-    return type(error)(
+    """The error without the folder of this run, so that it reads the same wherever it happened; an
+    OutputError where the machine failed, which is no design's fault.
+    """
+    kind: type[PlenoError] = type(error)
+    cause: BaseException | None = error
+    while cause is not None:
+        if isinstance(cause, OSError) and cause.errno in _MACHINE:
+            kind = OutputError
+        cause = cause.__cause__ or cause.__context__
+    return kind(
         *(
             None if part is None else part.replace(f"{folder}/", "")
             for part in (error.what, error.where, error.fix)

@@ -103,9 +103,17 @@ def drawing(
         made = Drawing(Figure(figsize=(width, height), dpi=DPI, layout=layout))
         FigureCanvasAgg(made.figure)
         yield made
+        powers = [
+            label
+            for axes in made.figure.axes
+            for axis in (axes.xaxis, axes.yaxis)
+            if axis.get_scale() == "log"
+            for label in axis.get_ticklabels(which="both")
+        ]
         for text in made.figure.findobj(matplotlib.text.Text):
-            text.set_text(printable_lines(text.get_text()))
-            text.set_parse_math(False)  # a $ in the name of a file is no formula
+            if text not in powers:
+                text.set_text(printable_lines(text.get_text()))
+                text.set_parse_math(False)  # a $ in the name of a file is no formula
         buffer = io.BytesIO()
         made.figure.savefig(buffer, format="png", metadata={"Software": None})
         made.png = buffer.getvalue()

@@ -344,7 +344,7 @@ def matrix_summary(
         left.set(xlabel="number", ylabel="singular value, relative to the largest")
         left.grid(True)
         if values is not None:
-            left.legend(loc="lower left")
+            left.legend(loc="upper right")
         energy = np.asarray(column_energy)[0].reshape(object_shape) * 100
         show_map(
             right,

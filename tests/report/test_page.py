@@ -214,3 +214,19 @@ def test_linear_light_is_encoded_for_the_screen():
     values, counts = np.unique(png.reshape(-1, 3), axis=0, return_counts=True)
     common = values[np.argsort(counts)[-3:]]
     assert any(np.abs(value - 127).max() <= 2 for value in common)  # sRGB: linear 0.214 is mid-grey
+
+
+def test_powers_of_ten_are_drawn_as_such_and_names_are_no_formulas():
+    """A $ in the name of a file is text; the marks of a logarithmic axis are not, which were shown
+    as "$\\mathdefault{10^{-2}}$".
+    """
+    from plenocli.report.drawing import drawing
+
+    with drawing(4, 3) as made:
+        axes = made.figure.subplots()
+        axes.semilogy([1, 2, 3], [1, 1e-4, 1e-8])
+        title = axes.set_title("$\\frac{1}{$.h5")
+    made.figure.canvas.draw()
+    marks = axes.yaxis.get_ticklabels(which="both")
+    assert any(r"\mathdefault" in mark.get_text() for mark in marks)
+    assert all(mark.get_parse_math() for mark in marks) and not title.get_parse_math()

@@ -18,7 +18,7 @@ from plenocli.base.progress import note
 from plenocli.forward.sensor.noise import Noise
 from plenocli.inverse.picture.diagnosis import Seen, what_is_seen
 from plenocli.inverse.picture.error_bars import of_picture, posterior
-from plenocli.inverse.picture.estimators import INNER, Estimators
+from plenocli.inverse.picture.estimators import Estimators
 from plenocli.inverse.picture.joint import JointEstimate, estimate_jointly, left_over, own_light
 from plenocli.inverse.picture.lenslet_model import LensletMatrix, Superpixels
 from plenocli.inverse.picture.methods.method import Method, Sees
@@ -264,7 +264,7 @@ def _settle(
 
     def believed() -> Belief:
         found = replace(level, found=left_over(estimators, data.y, joint.value))
-        inner = own[INNER] if min(own.shape[:2]) > 3 else own
+        inner = own[estimators.inner(own.shape[:2])] if min(own.shape[:2]) > 3 else own
         scene = data.scene
         return believe(estimators, inner, found, scene, model_error=model_error, coupled=True)
 

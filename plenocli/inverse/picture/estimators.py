@@ -169,6 +169,13 @@ class Estimators:
         """The matrix of `count` lenslets (rows, columns), neighbours' light included."""
         return BlockToeplitz(self.system.blocks, self.system.offsets, count)
 
+    def inner(self, count: tuple[int, int]) -> tuple[slice, slice]:
+        """Of `count` lenslets (rows, columns) those that have all neighbours that the matrix knows;
+        where none has, those that are not at the border.
+        """
+        reach = int(np.abs(self.system.offsets).max())
+        return (slice(reach, -reach),) * 2 if 0 < 2 * reach < min(count) else INNER
+
     def without_stray(self, y: np.ndarray) -> np.ndarray:
         """Superpixels y (lenslet_row, lenslet_column, pixel) without the neighbours' light, as
         block means tell it: enough to estimate noise and contrast.

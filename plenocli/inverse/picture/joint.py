@@ -8,7 +8,7 @@ import numpy as np
 
 from plenocli.base.tiling import to_blocks, to_plane
 from plenocli.inverse.picture import error_bars
-from plenocli.inverse.picture.estimators import INNER, Estimators, root_mean_square
+from plenocli.inverse.picture.estimators import Estimators, root_mean_square
 from plenocli.inverse.picture.lenslet_model import Superpixels
 from plenocli.inverse.spectra.lattice_system import LatticeSystem, PointPrior
 
@@ -104,4 +104,5 @@ def left_over(estimators: Estimators, y: np.ndarray, x: np.ndarray) -> float:
     (all, where none has).
     """
     rest = y - estimators.sensor(y.shape[:2]).forward(x)
-    return root_mean_square(rest[INNER] if rest[INNER].size else rest)
+    inner = rest[estimators.inner(y.shape[:2])]
+    return root_mean_square(inner if inner.size else rest)

@@ -11,7 +11,7 @@ from types import EllipsisType
 import numpy as np
 
 from plenocli.base.progress import note
-from plenocli.inverse.picture.estimators import INNER, Estimators, root_mean_square
+from plenocli.inverse.picture.estimators import Estimators, root_mean_square
 from plenocli.inverse.picture.footprint import Phases
 from plenocli.inverse.picture.joint import JointEstimate, estimate_jointly, own_light
 from plenocli.inverse.picture.lenslet_model import Superpixels
@@ -41,18 +41,15 @@ class OwnLight:
     y: (lenslet_row, lenslet_column, pixel) own light, in units of A x.
     truth: (lenslet_row, lenslet_column, point) the true objects, to choose a weight with hindsight.
     joint: the estimate that took the neighbours' light away, None where there is none of it; then
-        the lenslets of the border stay what they are there.
+        lenslets that light from beyond the array reaches stay what they are there.
+    inner: the lenslets that the method estimates.
     """
 
     data: Superpixels
     y: np.ndarray
     truth: np.ndarray | None = None
     joint: JointEstimate | None = None
-
-    @property
-    def inner(self) -> tuple[slice, slice] | EllipsisType:
-        """The lenslets that the method estimates."""
-        return ... if self.joint is None else INNER
+    inner: tuple[slice, slice] | EllipsisType = ...
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -166,7 +163,8 @@ class Estimator(Method):
         if min(y.shape[:2]) <= 2:
             border = Estimate(value=joint.value, sigma=joint.sigma)
             return self._result(estimators, choice, border, taken)
-        light = OwnLight(data=data, y=y, truth=truth, joint=joint)
+        inner = estimators.inner(y.shape[:2])
+        light = OwnLight(data=data, y=y, truth=truth, joint=joint, inner=inner)
         own = self.estimate(estimators, light)
         distance = root_mean_square(own.value - joint.value)
         return self._result(estimators, choice, own, taken, distance)

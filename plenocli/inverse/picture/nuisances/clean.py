@@ -13,7 +13,7 @@ import numpy as np
 
 from plenocli.base.errors import PlenoError
 from plenocli.base.progress import note
-from plenocli.inverse.picture.estimators import INNER, Estimators, root_mean_square
+from plenocli.inverse.picture.estimators import Estimators, root_mean_square
 from plenocli.inverse.picture.joint import own_light
 from plenocli.inverse.picture.lenslet_model import Common, Shared, Superpixels
 from plenocli.inverse.picture.nuisances.defects import (
@@ -117,6 +117,8 @@ def clean(
         return bare
     loud = data.common("signal", lambda: root_mean_square(filled.y))
     model = PixelModel.of(lmmse, max(sigma, LEAST_NOISE * loud))
+    inner = np.zeros(data.y.shape[:2], bool)
+    inner[estimators.inner(data.y.shape[:2])] = True
     task = _Task(
         estimators=estimators,
         common=data.common,
@@ -124,7 +126,7 @@ def clean(
         model=model,
         unknown=unknown,
         blind=blind,
-        inner=_inner(data.y.shape[:2]),
+        inner=inner.ravel(),
         counted=own,
         clipped=clipped & ~unknown,
         declared=declared,
@@ -139,13 +141,6 @@ def clean(
 def _again(common: Common, name: Shared, work: Callable[[], Any], which: Any = 0) -> Any:
     """A Common of what is worked out a second time."""
     return common(name, work, ("again", which))
-
-
-def _inner(count: tuple[int, ...]) -> np.ndarray:
-    """Which of lenslets (rows, columns), in their order, have all their neighbours."""
-    inner = np.zeros(count, bool)
-    inner[INNER] = True
-    return inner.ravel()
 
 
 def _known_before(known: int, pixels: int) -> tuple[Finding, ...]:
@@ -238,6 +233,8 @@ class _Task:
         sign, clean = find_defects(
             self.model, own, unknown | clipped, self.estimators.system.pixel_shape, self.common
         )
+        unsure = self._unsure(y, stray).reshape(-1, shape[2])[seen].T
+        sign[np.abs(own - clean) < unsure] = 0
         hot = defects_among(self.model, own, clipped, (sign != 0) | unknown)
         sign[hot], clipped = 1, clipped & ~hot
         lost = unknown | (sign != 0)
@@ -287,6 +284,21 @@ class _Task:
             x = lmmse.apply(stacked, lmmse.scales(stacked, self.common))
             own = own_light(self.estimators, y, x.T.reshape(*y.shape[:2], -1))
         return own
+
+    def _unsure(self, y: np.ndarray, stray: np.ndarray) -> np.ndarray:
+        """What the neighbours' light may be mistaken by: itself, as it comes from guesses, and from
+        beyond the array as much as the brightest neighbours would send.
+
+        y, stray: (lenslet_row, lenslet_column, pixel), superpixels and neighbours' light in them.
+        """
+        system, unsure = self.estimators.system, np.abs(stray)
+        if self.estimators.coupled:
+            beyond = (system.even_blocks.sum(axis=0) - system.even) @ system.levels(y).max(
+                axis=(0, 1)
+            )
+            edge = ~self.inner.reshape(y.shape[:2])
+            unsure[edge] = np.maximum(unsure[edge], beyond)
+        return unsure
 
     def _misfit(self, stacked: np.ndarray) -> float:
         return float(np.median(by_lenslet(np.abs(deviation(self.model, stacked)))))

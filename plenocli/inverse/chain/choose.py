@@ -18,11 +18,6 @@ MARGIN, PART = 0.04, 0.25
 """dB, and share of what is allowed, by which a chain must do better, since rehearsals miss."""
 FAR = 2.0
 """dB beyond what is allowed from which on matrices without neighbours are not looked at further."""
-DOUBT = 0.25
-"""dB by which a coarser matrix does better than the finest from which on a rehearsal says nothing
-of matrices: what it shows then is how reconstruct takes a right matrix for a wrong one, which
-another capture may not repeat.
-"""
 SLACK = 0.3
 """dB by which the sum of both losses may be mistaken: chains within it are rehearsed themselves."""
 
@@ -48,8 +43,6 @@ class ChainPlan:
     allowed: loss, dB.
     noise: of a pixel relative to the signal, in the rehearsal.
     lenslets, runs: that were captured, and reconstructions of them that were made.
-    doubted: whether a coarser matrix did better than the finest, which is taken then, with the
-        method that does best with it.
     """
 
     chosen: Weighed
@@ -59,7 +52,6 @@ class ChainPlan:
     noise: float
     lenslets: int
     runs: int
-    doubted: bool = False
 
 
 def choose(chains: Sequence[Chain], rehearsal: Rehearsal, allowed: float) -> ChainPlan:
@@ -69,8 +61,7 @@ def choose(chains: Sequence[Chain], rehearsal: Rehearsal, allowed: float) -> Cha
 
     Every method is rehearsed with the finest matrix, and every matrix by one method; losses of
     matrix and method add up to what a chain is expected to lose. From the cheapest on, those that
-    may serve are then rehearsed themselves until one does. The best chain serves always; where a
-    coarser matrix does better than the finest, it is the best of the finest.
+    may serve are then rehearsed themselves until one does. The best chain serves always.
     """
     matrices = list(dict.fromkeys(chain.matrix for chain in chains))
     finest = min(matrices, key=_fineness)
@@ -97,14 +88,10 @@ def choose(chains: Sequence[Chain], rehearsal: Rehearsal, allowed: float) -> Cha
         known[chain] = rehearsal.psnr(chain.matrix, chain.inversion)
         top = max(top, known[chain])
     best = max(known, key=lambda chain: known[chain])
-    doubted = max(by_matrix.values()) - by_matrix[finest] > DOUBT
-    if doubted:
-        safe = (chain for chain in known if chain.matrix is finest)
-        best = max(safe, key=lambda chain: known[chain])
     limit = (1 - PART) * allowed - MARGIN
     chosen = best
     for chain in chains:
-        if doubted or chain.seconds >= best.seconds:
+        if chain.seconds >= best.seconds:
             break
         if chain not in known and top - expected(chain) > limit + SLACK:
             continue
@@ -130,7 +117,6 @@ def choose(chains: Sequence[Chain], rehearsal: Rehearsal, allowed: float) -> Cha
         noise=rehearsal.noise,
         lenslets=rehearsal.lenslets,
         runs=rehearsal.runs,
-        doubted=doubted,
     )
 
 

@@ -1,13 +1,14 @@
 """What chains lose, rehearsed: a small part of the scene is captured by a cheap pilot matrix and
 inverted with matrices that are as wrong as each chain's would be.
 
-The pilot is the paraxial model with neighbours. How a candidate is wrong is computed where that is
-cheap, on isolated lenslets: its own superpixel less that of the finest model, with its true
-structure. docs/model.md, "The cheapest chain".
+The pilot is the finest matrix, or the paraxial model where that takes long. How a candidate is
+wrong is computed where that is cheap, on isolated lenslets: its own superpixel less that of the
+finest model, with its true structure. docs/model.md, "The cheapest chain".
 """
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,7 +26,7 @@ from plenocli.forward.propagation.system_matrix import build_pif
 from plenocli.forward.scene.light import Quadrature
 from plenocli.forward.scene.sample import ALL
 from plenocli.forward.scene.scenes import Scene
-from plenocli.forward.sensor.exposure import ExposureOptions, simulate_capture
+from plenocli.forward.sensor.exposure import ExposureOptions, SimulatedCapture, simulate_capture
 from plenocli.inverse.chain.chains import Inversion, MatrixOption
 from plenocli.inverse.picture.estimate import estimate
 from plenocli.inverse.picture.estimators import Estimators, Options
@@ -34,13 +35,15 @@ from plenocli.inverse.picture.methods.registry import METHODS
 from plenocli.inverse.picture.superpixels import superpixels
 from plenocli.inverse.prior.scene_prior import ReadPictures
 
-SIDE = 10
+SIDE = 16
 """Lenslets (a side) of the part of the scene that is captured."""
 REFINE = 3
 """Points of the scene (a side) for each of the picture: objects are finer than any picture."""
 FINER = 3.0
 """What the reference is more accurate than the finest candidate."""
 FINEST = 1e-6
+LONG = 10.0
+"""Seconds of the matrix of the capture from which on the pilot is paraxial."""
 
 
 class Middle:
@@ -91,22 +94,27 @@ class Rehearsal:
         part = (min(count[0], SIDE), min(count[1], SIDE))
         self.lenslets = part[0] * part[1]
         small = camera.replace(**{"lenslet_array.count": part})
-        plan = _paraxial(camera, finest.superpixels, finest.accuracy)
-        self.pilot = _matrix(camera, plan)
-        made = simulate_capture(
-            small,
-            source,
-            Middle(scene, (count[0], count[1]), part),
-            replace(
+        middle = Middle(scene, (count[0], count[1]), part)
+
+        def captured(plan: PifPlan) -> SimulatedCapture:
+            options = replace(
                 exposure,
                 refine=REFINE,
                 model=plan.model,
                 accuracy=plan.accuracy,
                 superpixels=plan.superpixels,
                 seed=seed + 1,
-            ),
-            name=name,
-        )
+            )
+            return simulate_capture(small, source, middle, options, name=name)
+
+        made = None
+        if REFINE**2 * finest.plan.chosen.seconds() <= LONG:
+            with suppress(NumericsError):
+                plan, made = finest.plan, captured(finest.plan)
+        if made is None:
+            plan = _paraxial(camera, finest.superpixels, finest.accuracy)
+            made = captured(plan)
+        self.pilot = _matrix(camera, plan)
         self.data = superpixels(made.capture, self.pilot)
         seen = made.in_memory().scene
         assert isinstance(seen, np.ndarray)

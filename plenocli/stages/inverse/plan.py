@@ -58,7 +58,6 @@ class PlanReport:
             "noise_relative": plan.noise,
             "rehearsed_lenslets": plan.lenslets,
             "rehearsals": plan.runs,
-            "doubted": plan.doubted,
             "cpu_seconds": self.cpu_seconds,
             "commands": list(self.commands),
             "chains": [
@@ -95,11 +94,6 @@ class PlanReport:
         )
         hidden = len(plan.weighed) - len(shown)
         more = [f"and {hidden} that lose more"] if hidden else []
-        if plan.doubted:
-            more.append(
-                "a coarser matrix did better in rehearsal than the finest, which is no rule: the "
-                "finest is taken"
-            )
         return "\n".join([*(f"# {line}" for line in (head, *table, *more)), *self.commands])
 
 

@@ -167,15 +167,3 @@ def test_spectral_cameras_are_refused_in_words_that_help(capsys):
     said = capsys.readouterr().err
     assert "pictures of one band" in said and "trade_spectral.toml" in said
     assert run(["plan", str(sample("tiny.toml")), "--scene", "x", "--quality-loss", "-1dB"]) == 2
-
-
-def test_a_rehearsal_in_which_coarser_is_better_decides_on_methods_only():
-    chains, table = drawn(np.random.default_rng(2), 0.0)
-    known = {(c.matrix.superpixels, c.matrix.accuracy): c.matrix for c in chains}
-    finest = known[(3, 3), 1e-3]
-    off = {key: db - (1.0 if key[0] is finest else 0.0) for key, db in table.items()}
-    plan = choose(chains, Table(off), 1.0)
-    assert plan.doubted and plan.chosen is plan.best and plan.chosen.chain.matrix is finest
-    best = max(INVERSIONS, key=lambda i: table[finest, i])
-    assert plan.chosen.chain.inversion == best
-    assert not choose(chains, Table(table), 1.0).doubted

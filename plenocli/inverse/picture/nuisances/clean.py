@@ -233,8 +233,7 @@ class _Task:
         sign, clean = find_defects(
             self.model, own, unknown | clipped, self.estimators.system.pixel_shape, self.common
         )
-        unsure = self._unsure(y, stray).reshape(-1, shape[2])[seen].T
-        sign[np.abs(own - clean) < unsure] = 0
+        sign[self._unsure(y, stray, own - clean)] = 0
         hot = defects_among(self.model, own, clipped, (sign != 0) | unknown)
         sign[hot], clipped = 1, clipped & ~hot
         lost = unknown | (sign != 0)
@@ -285,19 +284,20 @@ class _Task:
             own = own_light(self.estimators, y, x.T.reshape(*y.shape[:2], -1))
         return own
 
-    def _unsure(self, y: np.ndarray, stray: np.ndarray) -> np.ndarray:
-        """What the neighbours' light may be mistaken by: itself, as it comes from guesses, and from
-        beyond the array as much as the brightest neighbours would send.
+    def _unsure(self, y: np.ndarray, stray: np.ndarray, off: np.ndarray) -> np.ndarray:
+        """Which deviations may be the neighbours' light, which comes from guesses: those that are
+        no larger, and above what the others tell those that are no more than the brightest
+        neighbours would send from beyond the array.
 
         y, stray: (lenslet_row, lenslet_column, pixel), superpixels and neighbours' light in them.
+        off: (pixel, signal) deviations, of lenslets that are not blind.
         """
-        system, unsure = self.estimators.system, np.abs(stray)
+        system, most = self.estimators.system, np.abs(stray).reshape(-1, y.shape[2])
+        unsure = np.abs(off) < most[~self.blind].T
         if self.estimators.coupled:
-            beyond = (system.even_blocks.sum(axis=0) - system.even) @ system.levels(y).max(
-                axis=(0, 1)
-            )
-            edge = ~self.inner.reshape(y.shape[:2])
-            unsure[edge] = np.maximum(unsure[edge], beyond)
+            neighbours = system.even_blocks.sum(axis=0) - system.even
+            beyond = neighbours @ system.levels(y).max(axis=(0, 1))
+            unsure |= (off < beyond[:, None]) & (off > 0) & ~self.inner[~self.blind]
         return unsure
 
     def _misfit(self, stacked: np.ndarray) -> float:

@@ -178,3 +178,19 @@ def test_a_real_matrix_of_condition_1e12_and_captures_at_the_extremes():
         scale = max(np.abs(y).max(), 1e-300)
         for x in (nnls.projected_gradient(a, y, 5).x, extremes.wiener(a, y, 1e-3 * scale)[0]):
             assert np.isfinite(x).all(), name
+
+
+def test_captures_of_any_unit_are_reconstructed():
+    """Whose squares overflow, and with noise that the values do not show."""
+    import dataclasses
+
+    import plenocli as pc
+
+    camera = pc.read_camera(pc.sample("tiny.toml"))
+    matrix = pc.system_matrix(camera, accuracy=1e-2)
+    shot = pc.simulate_capture(camera, "skimage:coffee", matrix=matrix, snr_db=40)
+    loud = np.asarray(shot.capture.mosaic, float) * 1e300 / np.max(shot.capture.mosaic)
+    shot = dataclasses.replace(shot, capture=dataclasses.replace(shot.capture, mosaic=loud))
+    for method in ("tikhonov", "lmmse"):
+        found = pc.reconstruct(shot, matrix, method=method).value
+        assert np.isfinite(found).all() and 1e299 < np.mean(found) < 1e301

@@ -208,7 +208,8 @@ def unit_of(system: LensletMatrix, y: np.ndarray) -> float:
     photographs; 1 for an empty one.
     """
     levels = system.levels(np.where(np.isfinite(y), y, 0))
-    found = float(np.sqrt(np.mean(levels**2))) / BRIGHTNESS
+    largest = float(np.abs(levels).max()) or 1.0  # beyond 1e154 squares overflow
+    found = float(np.sqrt(np.mean((levels / largest) ** 2))) * largest / BRIGHTNESS
     return found if found > 0 else 1.0
 
 

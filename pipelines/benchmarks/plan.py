@@ -50,11 +50,11 @@ from plenocli.inverse.picture.superpixels import superpixels
 TINY = Path(__file__).resolve().parents[2] / "sample_configs" / "tiny.toml"
 SCENES = {
     "fit": ("camera", "coins", "moon", "grass"),
-    "judge": ("astronaut", "coffee", "chelsea", "rocket", "retina"),
+    "judge": ("astronaut", "coffee", "chelsea", "rocket", "retina", "ihc", "motorcycle_left"),
 }
 SIZED = (("demo_spatial.toml", (12, 12)),)
 """Cameras, with lenslets, by which --fit sees how costs grow."""
-FIRST = {"fit": 0, "judge": 100}
+FIRST = {"fit": 0, "judge": 200}
 """Number of the first case: those of the judgement below were looked at while `plan` was made."""
 ALLOWED = (0.1, 0.3, 1.0)
 """dB of --quality-loss that are judged."""

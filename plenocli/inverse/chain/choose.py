@@ -7,6 +7,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from plenocli.inverse.chain.chains import Chain, Inversion, MatrixOption
 from plenocli.inverse.chain.rehearsal import Rehearsal
 from plenocli.inverse.picture.methods.method import Sees
@@ -26,7 +28,7 @@ SLACK = 0.3
 class Weighed:
     """A chain with what it is predicted to lose.
 
-    loss: dB against the best chain.
+    loss: dB against the best chain, of the capture where that is most.
     rehearsed: whether the chain itself was, and not its matrix and its method apart.
     """
 
@@ -69,7 +71,7 @@ def choose(chains: Sequence[Chain], rehearsal: Rehearsal, allowed: float) -> Cha
     by_method = {m: rehearsal.psnr(finest, m) for m in methods}
     by_matrix = _by_matrix(matrices, finest, rehearsal, allowed)
 
-    def expected(chain: Chain) -> float:
+    def expected(chain: Chain) -> np.ndarray:
         if METHODS[chain.inversion.method].sees is Sees.LENSLET_AS_IS:
             return by_method[chain.inversion]  # the mean of a lenslet hardly needs the matrix
         return by_method[chain.inversion] + by_matrix[chain.matrix] - by_method[PROBE]
@@ -80,31 +82,35 @@ def choose(chains: Sequence[Chain], rehearsal: Rehearsal, allowed: float) -> Cha
         for chain in chains
         if (found := rehearsal.known(chain.matrix, chain.inversion)) is not None
     }
-    top = max(known.values())
-    promising = sorted((c for c in chains if c not in known), key=expected, reverse=True)
-    for chain in promising:
-        if expected(chain) <= top:
+
+    def lost(psnr: np.ndarray) -> float:
+        """Against the best chain of each capture, where that is most."""
+        return float(np.max(np.max(list(known.values()), axis=0) - psnr))
+
+    def mean(chain: Chain) -> float:
+        return float(np.mean(expected(chain)))
+
+    for chain in sorted((c for c in chains if c not in known), key=mean, reverse=True):
+        if mean(chain) <= max(float(np.mean(found)) for found in known.values()):
             break
         known[chain] = rehearsal.psnr(chain.matrix, chain.inversion)
-        top = max(top, known[chain])
-    best = max(known, key=lambda chain: known[chain])
+    best = min(known, key=lambda chain: lost(known[chain]))
     limit = (1 - PART) * allowed - MARGIN
     chosen = best
     for chain in chains:
         if chain.seconds >= best.seconds:
             break
-        if chain not in known and top - expected(chain) > limit + SLACK:
+        if chain not in known and lost(expected(chain)) > limit + SLACK:
             continue
         if chain not in known:
             known[chain] = rehearsal.psnr(chain.matrix, chain.inversion)
-            top = max(top, known[chain])
-        if top - known[chain] <= limit:
+        if lost(known[chain]) <= limit:
             chosen = chain
             break
     weighed = {
         chain: Weighed(
             chain=chain,
-            loss=max(top - known.get(chain, expected(chain)), 0.0),
+            loss=max(lost(known.get(chain, expected(chain))), 0.0),
             rehearsed=chain in known,
         )
         for chain in chains
@@ -122,14 +128,14 @@ def choose(chains: Sequence[Chain], rehearsal: Rehearsal, allowed: float) -> Cha
 
 def _by_matrix(
     matrices: Sequence[MatrixOption], finest: MatrixOption, rehearsal: Rehearsal, allowed: float
-) -> dict[MatrixOption, float]:
+) -> dict[MatrixOption, np.ndarray]:
     """PSNR (dB) with each matrix by the probe. Without neighbours' light the finest comes first:
     where it loses far too much the others are taken to be no better.
     """
     own = sorted((m for m in matrices if m.own_only and not finest.own_only), key=_fineness)
     found = {m: rehearsal.psnr(m, PROBE) for m in matrices if m not in own}
     for matrix in own:
-        far = own[0] in found and found[finest] - found[own[0]] > allowed + FAR
+        far = own[0] in found and float(np.min(found[finest] - found[own[0]])) > allowed + FAR
         found[matrix] = found[own[0]] if far else rehearsal.psnr(matrix, PROBE)
     return found
 

@@ -30,7 +30,7 @@ from plenocli.forward.sensor.exposure import ExposureOptions, SimulatedCapture, 
 from plenocli.inverse.chain.chains import Inversion, MatrixOption
 from plenocli.inverse.picture.estimate import estimate
 from plenocli.inverse.picture.estimators import Estimators, Options
-from plenocli.inverse.picture.lenslet_model import LensletMatrix, gathered
+from plenocli.inverse.picture.lenslet_model import LensletMatrix, Superpixels, gathered
 from plenocli.inverse.picture.methods.registry import METHODS
 from plenocli.inverse.picture.superpixels import superpixels
 from plenocli.inverse.prior.scene_prior import ReadPictures
@@ -42,8 +42,10 @@ REFINE = 3
 FINER = 3.0
 """What the reference is more accurate than the finest candidate."""
 FINEST = 1e-6
-LONG = 10.0
+LONG = 5.0
 """Seconds of the matrix of the capture from which on the pilot is paraxial."""
+DRAWS = 3
+"""Captures, which differ in their noise: what reconstruct finds may hang on it."""
 
 
 class Middle:
@@ -96,14 +98,14 @@ class Rehearsal:
         small = camera.replace(**{"lenslet_array.count": part})
         middle = Middle(scene, (count[0], count[1]), part)
 
-        def captured(plan: PifPlan) -> SimulatedCapture:
+        def captured(plan: PifPlan, draw: int = 0) -> SimulatedCapture:
             options = replace(
                 exposure,
                 refine=REFINE,
                 model=plan.model,
                 accuracy=plan.accuracy,
                 superpixels=plan.superpixels,
-                seed=seed + 1,
+                seed=seed + 1 + draw,
             )
             return simulate_capture(small, source, middle, options, name=name)
 
@@ -115,45 +117,42 @@ class Rehearsal:
             plan = _paraxial(camera, finest.superpixels, finest.accuracy)
             made = captured(plan)
         self.pilot = _matrix(camera, plan)
-        self.data = superpixels(made.capture, self.pilot)
+        shots = [made, *(captured(plan, draw) for draw in range(1, DRAWS))]
+        self.data = [superpixels(shot.capture, self.pilot) for shot in shots]
         seen = made.in_memory().scene
         assert isinstance(seen, np.ndarray)
         self.truth = to_blocks(np.asarray(seen[0], float), self.pilot.object_shape)
-        loud = float(np.sqrt(np.mean(np.square(self.data.y))))
-        self.noise = self.data.known_sigma / loud
+        data = self.data[0]
+        self.noise = data.known_sigma / float(np.sqrt(np.mean(np.square(data.y))))
         self._reference = self._isolated("exact", max(finest.accuracy / FINER, FINEST))
         if self._reference is None:
             self._reference = self._isolated("fresnel", max(finest.accuracy / FINER, FINEST))
         self._wrong: dict[tuple[str, float], np.ndarray] = {}
         self._ready: dict[MatrixOption, Estimators] = {}
-        self._found: dict[tuple[MatrixOption, Inversion], float] = {}
+        self._found: dict[tuple[MatrixOption, Inversion], np.ndarray] = {}
         self._first = Estimators(self.pilot, Options(seed=seed), read_pictures)
 
-    def psnr(self, matrix: MatrixOption, inversion: Inversion) -> float:
-        """PSNR (dB, peak 1) of the picture that a chain gives of the rehearsed part."""
+    def psnr(self, matrix: MatrixOption, inversion: Inversion) -> np.ndarray:
+        """PSNR (dB, peak 1; of every draw) of the picture that a chain gives of the part."""
         key = matrix, inversion
         if key not in self._found:
-            self._found[key] = self._tried(matrix, inversion)
+            self._found[key] = np.array([self._tried(matrix, inversion, d) for d in self.data])
         return self._found[key]
 
-    def known(self, matrix: MatrixOption, inversion: Inversion) -> float | None:
+    def known(self, matrix: MatrixOption, inversion: Inversion) -> np.ndarray | None:
         """The same of a chain that was rehearsed; None of another."""
         return self._found.get((matrix, inversion))
 
-    def _tried(self, matrix: MatrixOption, inversion: Inversion) -> float:
+    def _tried(self, matrix: MatrixOption, inversion: Inversion, data: Superpixels) -> float:
         estimators = self._estimators(matrix)
         options = Options(
             method=inversion.method, nnls_iterations=inversion.iterations, seed=self.seed
         )
         limits = what_limits(self.noise, estimators.system.accuracy)
         off = 0.0 if limits is None or limits.limited_by == "noise" else limits.model_error
+        made = estimators.with_options(options)
         with collected_notes():
-            found, _ = estimate(
-                estimators.with_options(options),
-                METHODS[inversion.method],
-                self.data,
-                model_error=off,
-            )
+            found, _ = estimate(made, METHODS[inversion.method], data, model_error=off)
         self.runs += 1
         error = float(np.mean(np.square(found.value.reshape(self.truth.shape) - self.truth)))
         return -10 * float(np.log10(max(error, 1e-12)))

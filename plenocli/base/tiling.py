@@ -55,6 +55,26 @@ def to_plane(blocks: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     )
 
 
+def in_lenslets(cells: np.ndarray, several: int) -> np.ndarray:
+    """(row, column, sample) of cells as those of their `several` lenslets, one below the other."""
+    rows, columns, _ = cells.shape
+    parts = cells.reshape(rows, columns, several, -1).swapaxes(1, 2)
+    return parts.reshape(rows * several, columns, -1)
+
+
+def in_cells(lenslets: np.ndarray, several: int) -> np.ndarray:
+    """The inverse of `in_lenslets`; what the last row of cells lacks is zero."""
+    if several == 1:
+        return lenslets
+    rows, columns, samples = lenslets.shape
+    whole = np.pad(lenslets, ((0, -rows % several), (0, 0), (0, 0)))
+    return (
+        whole.reshape(-1, several, columns, samples)
+        .swapaxes(1, 2)
+        .reshape(-1, columns, several * samples)
+    )
+
+
 @dataclass(frozen=True, kw_only=True)
 class InParts:
     """An array that comes in bands of rows while it is written or read.

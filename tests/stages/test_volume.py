@@ -248,6 +248,45 @@ def test_a_photographic_camera_with_planes_has_kernels(tmp_path):
     assert stack.spacing[1, 0] / stack.spacing[0, 0] == pytest.approx(0.55 / 0.45)
 
 
+HEXAGONAL = (
+    MICROSCOPE.replace("[lenslet_array]", '[lenslet_array]\nlattice = "hexagonal"')
+    .replace("[7, 7]", "[6, 7]")
+    .replace("[7, 6]", "[7, 7]")
+)
+
+
+def test_a_hexagonal_lattice_gives_a_specimen_back(tmp_path):
+    path = tmp_path / "hexagonal.toml"
+    path.write_text(HEXAGONAL)
+    with pytest.raises(ConfigError, match="half of 7 pixels aside"):
+        run_capture_sim(path, tmp_path / "seen.h5", Capture(), volume="phantom:beads")
+    path.write_text(HEXAGONAL.replace("[6, 7]", "[6, 8]").replace("4.2857143", "4"))
+    run_capture_sim(
+        path,
+        tmp_path / "seen.h5",
+        Capture(refine=2, snr_db=40, accuracy=2e-2),
+        volume="phantom:beads",
+        scene_out=tmp_path / "truth.h5",
+    )
+    shot = read_capture(tmp_path / "seen.h5")
+    # every other row stands half a superpixel aside, in the dark of the others
+    assert shot.shape == (7 * 6, 7 * 8 + 4)
+    assert abs(shot.mosaic[6:12, :4]).max() < 0.2 * abs(shot.mosaic).max()
+    run_simulate_pif(path, tmp_path / "stack.h5", Settings(accuracy=2e-2))
+    stack = read_stack(tmp_path / "stack.h5")
+    assert stack.lattice == "hexagonal" and stack.pixel_shape == (12, 8)
+    assert np.allclose(stack.spacing[0], np.array([np.sqrt(0.75), 1]) * 30e-6 / 20 / 2)
+    with collected_notes() as notes:
+        run_volume(tmp_path / "seen.h5", tmp_path / "volume.h5", tmp_path / "stack.h5", method="tv")
+    assert any("8 x 7 lenslets, 3 planes of 2 x 2 voxels a lenslet" in note for note in notes)
+    found, truth = (read_volume(tmp_path / f"{name}.h5") for name in ("volume", "truth"))
+    assert found.value.shape == truth.value.shape == (3, 16, 14)
+    inner = (slice(None), slice(3, -3), slice(3, -3))
+    alike = np.corrcoef(found.value[inner].ravel(), truth.value[inner].ravel())[0, 1]
+    turned = np.corrcoef(found.value[inner].ravel(), truth.value[inner][:, ::-1].ravel())[0, 1]
+    assert alike > 0.8 and turned < 0.5
+
+
 def test_ome_tiff_is_what_another_reader_reads(tmp_path):
     """Pixels by OpenImageIO, sizes from the XML by hand."""
     rng = np.random.default_rng(1)

@@ -28,7 +28,7 @@ def stack_artefact(stack: Stack, provenance: "Provenance") -> "Artefact":
         "stack/point_shape": np.array(stack.point_shape),
         "stack/column_energy": stack.column_energy,
     }
-    return Artefact("pif-stack", data, {}, provenance)
+    return Artefact("pif-stack", data, {"stack": {"lattice": stack.lattice}}, provenance)
 
 
 def read_stack(path: Path | str) -> Stack:
@@ -52,7 +52,10 @@ def stack_of(artefact: "Artefact", path: Path | str) -> Stack:
     pixels, points = (tuple(data[f"stack/{n}_shape"].tolist()) for n in ("pixel", "point"))
     plane = data["stack/plane"]
     numbers = np.arange(len(data["stack/depth"]))
+    lattice = str(artefact.attrs.get("stack", {}).get("lattice", "square"))
     whole = data["stack/A"].shape[1:] == (int(np.prod(pixels)), int(np.prod(points)))
+    # a hexagonal cell has two lenslets, one below the other
+    whole &= lattice == "square" or pixels[0] % 2 == points[0] % 2 == 0
     if not whole or not np.array_equal(np.unique(plane), numbers) or (np.diff(plane) < 0).any():
         raise InputError(
             "holds kernels that do not fit their planes, pixels or voxels",
@@ -70,4 +73,5 @@ def stack_of(artefact: "Artefact", path: Path | str) -> Stack:
         wavelength=float(data["stack/wavelength"][0]),
         column_energy=data["stack/column_energy"],
         accuracy=AccuracyRecord.from_json(artefact.provenance.accuracy) or AccuracyRecord(),
+        lattice=lattice,
     )

@@ -16,11 +16,10 @@ from plenocli.base.quantities import (
     Pair,
     Section,
     SignedLength,
-    Unit,
     planes_of,
 )
 from plenocli.base.units import format_length
-from plenocli.forward.camera.model import Aberration, Light, Sensor
+from plenocli.forward.camera.model import Aberration, Lattice, Light, Sensor
 from plenocli.forward.camera.plausible import unusual
 
 Planes = Annotated[
@@ -85,12 +84,13 @@ class Specimen(Section):
         return self
 
 
-class MicroscopeArray(Section):
-    """The lenslets, squares side by side; `fill_factor` is the open share of their area."""
+class MicroscopeArray(Lattice):
+    """The lenslets; on a hexagonal lattice rows are close-packed, and every other one stands half a
+    pitch to the right.
+    """
 
     pitch: Length
     focal_length: Length
-    fill_factor: Unit = 1.0
     count: Pair = (11, 11)
 
 
@@ -124,12 +124,13 @@ class Microscope(Section):
             raise ValueError(asked)
         for axis, pixels in enumerate(self.sensor.pixels_per_lenslet):
             spacing = self.lenslet_array.pitch / self.sensor.pixel_pitch
+            spacing *= self.lenslet_array.row_spacing if axis == 0 else 1.0
             if abs(pixels / spacing - 1) > 0.1:
                 raise ValueError(
                     f"sensor.pixels_per_lenslet {pixels} in {('rows', 'columns')[axis]}, but "
                     f"{spacing:.4g} pixels of {format_length(self.sensor.pixel_pitch)} fit under a "
-                    f"lenslet of {format_length(self.lenslet_array.pitch)}; captures are resampled "
-                    "to whole pixels, by at most a tenth"
+                    f"lenslet {format_length(self.lenslet_array.pitch)} wide; captures are "
+                    "resampled to whole pixels, by at most a tenth"
                 )
         deepest = max(abs(plane) for plane in self.object.planes)
         lens = self.objective

@@ -260,30 +260,15 @@ class Object(Section):
         return self
 
 
-class LensletArray(Section):
-    """The lenslets.
+class Lattice(Section):
+    """How lenslets stand, and their openings: `fill_factor` times the pitch across."""
 
-    profile: their phase in the exact model, "hyperbolic" (a plane wave comes to a point at the
-        focal length) or "parabolic" (the paraxial phase, which leaves spherical aberration).
-    """
-
-    distance: Length
-    pitch: Resolved[Length] = _LEFT_OUT
-    superpixel_pitch: Length | None = None
-    focal_length: Length
-    glass: Glass = "none"
     lattice: Literal["square", "hexagonal"] = "square"
     aperture_shape: Resolved[Literal["square", "circle", "hexagon"]] = _LEFT_OUT
     fill_factor: Unit = 1.0
-    profile: Literal["hyperbolic", "parabolic"] = "hyperbolic"
-    count: Pair = (11, 11)
 
     @model_validator(mode="after")
-    def _one_pitch(self) -> Self:
-        if (self.pitch is None) == (self.superpixel_pitch is None):
-            raise ValueError(
-                "give exactly one of pitch (on the array) and superpixel_pitch (on the sensor)"
-            )
+    def _apart(self) -> Self:
         if self.aperture_shape is None:
             square = self.lattice == "square"
             self.__dict__.update(aperture_shape="square" if square else "hexagon")
@@ -301,6 +286,30 @@ class LensletArray(Section):
         hexagonal lattice.
         """
         return ROW_SPACING if self.lattice == "hexagonal" else 1.0
+
+
+class LensletArray(Lattice):
+    """The lenslets.
+
+    profile: their phase in the exact model, "hyperbolic" (a plane wave comes to a point at the
+        focal length) or "parabolic" (the paraxial phase, which leaves spherical aberration).
+    """
+
+    distance: Length
+    pitch: Resolved[Length] = _LEFT_OUT
+    superpixel_pitch: Length | None = None
+    focal_length: Length
+    glass: Glass = "none"
+    profile: Literal["hyperbolic", "parabolic"] = "hyperbolic"
+    count: Pair = (11, 11)
+
+    @model_validator(mode="after")
+    def _one_pitch(self) -> Self:
+        if (self.pitch is None) == (self.superpixel_pitch is None):
+            raise ValueError(
+                "give exactly one of pitch (on the array) and superpixel_pitch (on the sensor)"
+            )
+        return self
 
 
 Share = Annotated[float, Field(ge=0.0, lt=1.0)]

@@ -44,11 +44,18 @@ class SuperpixelGrid:
     centre: np.ndarray | None = None
 
     @classmethod
-    def tiled(cls, count: tuple[int, int], shape: tuple[int, int]) -> SuperpixelGrid:
-        """That of `count` superpixels of `shape` pixels side by side."""
+    def tiled(
+        cls, count: tuple[int, int], shape: tuple[int, int], lattice: str = "square"
+    ) -> SuperpixelGrid:
+        """That of `count` superpixels of `shape` pixels side by side; every other row of a
+        hexagonal lattice stands half of one to the right.
+        """
         first = (np.array(shape) - 1) / 2
         index = np.stack(np.meshgrid(*(np.arange(n) for n in count), indexing="ij"), axis=-1)
-        return cls(shape=tuple(shape), count=tuple(count), centre=first + index * np.array(shape))
+        centre = first + index * np.array(shape)
+        if lattice == "hexagonal":
+            centre[1::2, :, 1] += shape[1] / 2
+        return cls(shape=tuple(shape), count=tuple(count), centre=centre)
 
 
 @dataclass(frozen=True, kw_only=True)

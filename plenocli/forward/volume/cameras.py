@@ -28,7 +28,9 @@ def optics_of(camera: Microscope) -> VolumeOptics:
         index=lens.specimen_index or lens.medium_index,
         magnification=lens.magnification,
         pitch=array.pitch,
-        open_width=array.pitch * math.sqrt(array.fill_factor),
+        open_width=array.pitch * array.fill_factor,
+        lattice=array.lattice,
+        opening=array.aperture_shape,
         focal_length=array.focal_length,
         sensor_distance=sensor.distance,
         pupil_distance=math.inf,
@@ -51,7 +53,7 @@ def optics_of_camera(camera: Camera) -> VolumeOptics:
     A point at distance z1 is behind the lens in focus 1/z1 = 1/f - 1/z2 - eps: its wave at the
     lenslets is that of a point z2^2 eps away from focus, paraxially, seen through a pupil z2 away.
 
-    Raises ConfigError for lenslets and pupils whose light is not separable or not round.
+    Raises ConfigError for pupils that are not round, or not those of a thin lens.
     """
     lens, array, sensor, z2 = (
         camera.main_lens,
@@ -59,12 +61,6 @@ def optics_of_camera(camera: Camera) -> VolumeOptics:
         camera.sensor,
         camera.lenslet_array.distance,
     )
-    if (array.lattice, array.aperture_shape) != ("square", "square"):
-        raise ConfigError(
-            "volumes are computed behind square lenslets on a square lattice",
-            "lenslet_array",
-            "leave [object] planes and layers out",
-        )
     if lens.aperture_shape != "circle" or camera.filter_array is not None:
         raise ConfigError(
             "volumes are computed through a clear round pupil",
@@ -88,7 +84,9 @@ def optics_of_camera(camera: Camera) -> VolumeOptics:
         index=math.inf,
         magnification=1.0,
         pitch=array.pitch,
-        open_width=array.pitch * math.sqrt(array.fill_factor),
+        open_width=array.pitch * array.fill_factor,
+        lattice=array.lattice,
+        opening=array.aperture_shape,
         focal_length=array.focal_length,
         sensor_distance=sensor.distance,
         pupil_distance=z2,

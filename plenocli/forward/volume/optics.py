@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from plenocli.forward.camera.model import ROW_SPACING
 from plenocli.forward.camera.quadrature import gauss
 
 PUPIL_TERMS = 1e-7
@@ -38,11 +39,13 @@ class VolumeOptics:
     aperture: largest direction s of the light that is used.
     index: refractive index of the specimen; infinite paraxially, where depth bends phases by s^2/2.
     magnification: from the specimen to the lenslet array.
-    pitch, open_width: of lenslets, m; they are squares.
+    pitch, open_width: of lenslets, m, the latter across flat sides.
+    lattice: "square" or "hexagonal", with close-packed rows along x.
+    opening: of lenslets, "square", "circle" or "hexagon", with two flat sides facing +-x.
     focal_length: of lenslets, m.
     sensor_distance: from lenslets to pixels, m.
     pupil_distance: from the exit pupil to lenslets, m; infinite where chief rays are parallel.
-    pixels: (rows, columns) of a superpixel.
+    pixels: (rows, columns) of a superpixel, which is as high as rows of lenslets are apart.
     pixel_width: share of the pixel pitch that senses light, along an axis.
     depths: (plane,) m, effective: phases are k depth (sqrt(index^2 - s^2) - index).
     places: (plane,) m as they are named: the depths, or distances from a main lens.
@@ -73,6 +76,8 @@ class VolumeOptics:
     mismatch: tuple[float, float] | None = None
     band: tuple[float, ...] = ()
     terms: tuple[Term, ...] = ()
+    lattice: str = "square"
+    opening: str = "square"
 
     @property
     def lines(self) -> tuple[VolumeOptics, ...]:
@@ -95,6 +100,47 @@ class VolumeOptics:
     def object_pitch(self) -> float:
         """Of the lenslets' images in the focused plane, m."""
         return self.pitch / self.magnification
+
+    @property
+    def row_spacing(self) -> float:
+        """Of lenslets, pitches."""
+        return ROW_SPACING if self.lattice == "hexagonal" else 1.0
+
+    @property
+    def sites(self) -> tuple[tuple[float, float], ...]:
+        """Lenslets of one cell, the part of the array that repeats along rows and columns: (row,
+        column) from its middle, pitches. Two rows of a hexagonal lattice make one of cells.
+        """
+        if self.lattice == "square":
+            return ((0.0, 0.0),)
+        return ((-ROW_SPACING / 2, -0.25), (ROW_SPACING / 2, 0.25))
+
+    @property
+    def cell_pixels(self) -> tuple[int, int]:
+        """Pixels (rows, columns) of a cell: those of its lenslets, one below the other."""
+        return len(self.sites) * self.pixels[0], self.pixels[1]
+
+    @property
+    def object_cell(self) -> tuple[float, float]:
+        """Height and width (m) of a cell's image in the focused plane."""
+        return len(self.sites) * self.row_spacing * self.object_pitch, self.object_pitch
+
+    @property
+    def separable(self) -> bool:
+        """Whether lenslets do the same to all rows of a field: squares on a square lattice."""
+        return (self.lattice, self.opening) == ("square", "square")
+
+    @property
+    def turnable(self) -> bool:
+        """Whether rows and columns of the array may change places."""
+        square = self.lattice == "square" and self.opening != "hexagon"
+        return square and self.pixels[0] == self.pixels[1]
+
+    @property
+    def gapless(self) -> bool:
+        """Whether all light on the array enters lenslets."""
+        fills = {"square": "square", "hexagonal": "hexagon"}[self.lattice]
+        return self.opening == fills and self.open_width == self.pitch
 
     @property
     def round(self) -> bool:
@@ -175,6 +221,7 @@ class VolumeOptics:
         count: of nodes a pixel; axis: 0 rows, 1 columns.
         """
         size = self.pitch * self.widening / self.pixels[axis]
+        size *= self.row_spacing if axis == 0 else 1.0
         centre = (np.arange(self.pixels[axis]) - (self.pixels[axis] - 1) / 2) * size
         x, w = gauss(count)
         half = size * self.pixel_width / 2

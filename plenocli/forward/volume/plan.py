@@ -12,19 +12,24 @@ from functools import lru_cache
 
 import numpy as np
 
-from plenocli.base.errors import NumericsError
+from plenocli.base.errors import NumericsError, UsageError
 from plenocli.forward.accuracy.machine_rate import product_rate
 from plenocli.forward.propagation.plan import NOMINAL_RATE
 from plenocli.forward.volume.arriving import ArrivingField
 from plenocli.forward.volume.lenslets import sampling, terms_for
 from plenocli.forward.volume.optics import VolumeOptics
 from plenocli.forward.volume.rays import RayPlane
+from plenocli.forward.volume.shaped import ShapedPlane
 from plenocli.forward.volume.waves import WavePlane, WaveSettings, near
 
 WAVES = ((1, 2), (2, 3), (3, 4), (4, 4), (6, 5), (9, 7))
 """Rungs of wave optics: neighbours on each side whose fields interfere, nodes across a pixel."""
 FINEST = (12, 9)
 """What rungs are held against."""
+SHAPED, SHAPED_FINEST = (2, 3, 4, 6), 9
+"""Places across a pixel, of rungs behind lenslets that are no squares, and what these are held
+against.
+"""
 RAYS = 8
 """Rays across a pixel."""
 LEAST_LOST = 5e-3
@@ -41,6 +46,8 @@ BOX = 2
 """Points along each side of a voxel that stand for it, its light being their mean."""
 OVERHEAD = 1.9
 """Time over that of the products."""
+SHAPED_PRODUCTS = 150.0
+"""Of a place of ShapedPlane's torus, for each doubling of their number."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,12 +55,14 @@ class VolumePlan:
     """How the kernels of a volume are computed.
 
     model: "ray" or "fresnel".
-    neighbours, pixel_nodes, terms: as WaveSettings; nodes are rays across a pixel for rays.
+    neighbours, pixel_nodes, terms: as WaveSettings; nodes are rays across a pixel for rays, places
+        where neighbours are all (0).
     reach: (plane,) superpixels on each side of a point's own.
     lost: (plane,) share of light beyond them, as expected.
     error: share of a column's light that is elsewhere among the superpixels kept, as tried.
     asked: the same, asked for.
-    samples: voxels (rows, columns) of a lenslet; box: points (rows, columns) that stand for one.
+    samples: voxels (rows, columns) of a cell, of a lenslet where that is one; box: points (rows,
+        columns) that stand for one.
     seconds, nominal_seconds: of one core of this machine, and of one at the nominal rate.
     bytes: of the kernels.
     considered: (rung, error) of all that were tried.
@@ -79,6 +88,8 @@ class VolumePlan:
         """Name of what was chosen."""
         if self.model == "ray":
             return "rays"
+        if self.neighbours == 0:
+            return f"waves, {self.pixel_nodes} places across a pixel"
         return f"waves, {self.neighbours} neighbours on each side"
 
     def settings(self, plane: int) -> WaveSettings:
@@ -90,11 +101,14 @@ class VolumePlan:
             reach=self.reach[plane],
         )
 
-    def plane(self, optics: VolumeOptics, number: int) -> WavePlane | RayPlane:
+    def plane(self, optics: VolumeOptics, number: int) -> WavePlane | ShapedPlane | RayPlane:
         """Columns of the plane with this number."""
+        depth, reach = optics.depths[number], self.reach[number]
         if self.model == "ray":
-            return RayPlane(optics, optics.depths[number], self.reach[number], self.pixel_nodes)
-        return WavePlane(optics, optics.depths[number], self.settings(number))
+            return RayPlane(optics, depth, reach, self.pixel_nodes)
+        if not optics.separable:
+            return ShapedPlane(optics, depth, reach, self.pixel_nodes)
+        return WavePlane(optics, depth, self.settings(number))
 
 
 def plan_volume(
@@ -112,8 +126,16 @@ def plan_volume(
     model: "auto", "ray" or "fresnel".
     box: points along each side of a voxel that stand for it.
 
-    Raises NumericsError where no rung meets it, or light is spread too far.
+    Raises NumericsError where no rung meets it, or light is spread too far; UsageError for rays
+    behind lenslets that are no squares.
     """
+    if model == "ray" and not optics.separable:
+        raise UsageError(
+            f"rays are followed behind square lenslets on a square lattice, not {optics.opening}s "
+            f"on a {optics.lattice} one",
+            "--model",
+            "take fresnel or auto",
+        )
     spread = [_reach(optics, depth, max(accuracy, LEAST_LOST)) for depth in optics.depths]
     reach = tuple(r for r, _ in spread)
     if max(reach) > MOST_REACH:
@@ -127,7 +149,7 @@ def plan_volume(
     terms = max(terms_for(line, min(1e-3, accuracy / 10)) for line in optics.lines)
     considered: list[tuple[str, float]] = []
     found = None
-    for name, candidate in _rungs(model, terms):
+    for name, candidate in _rungs(optics, model):
         error = max(_error(optics, candidate, depth) for depth in _tried(optics))
         considered.append((name, error))
         if error <= accuracy or (model == "ray"):
@@ -141,7 +163,7 @@ def plan_volume(
         )
     (nodes, neighbours), error = found
     plan = VolumePlan(
-        model="ray" if neighbours == 0 else "fresnel",
+        model="ray" if neighbours == 0 and optics.separable else "fresnel",
         neighbours=neighbours,
         pixel_nodes=nodes,
         terms=terms,
@@ -149,11 +171,13 @@ def plan_volume(
         lost=tuple(lost for _, lost in spread),
         error=error,
         asked=accuracy,
-        samples=samples,
+        samples=(len(optics.sites) * samples[0], samples[1]),
         box=box,
         seconds=0.0,
         nominal_seconds=0.0,
-        bytes=4 * math.prod((*optics.pixels, *samples)) * sum(int(near(r).sum()) for r in reach),
+        bytes=4
+        * math.prod((*optics.cell_pixels, len(optics.sites), *samples))
+        * sum(int(near(r, optics).sum()) for r in reach),
         considered=tuple(considered),
     )
     return replace(
@@ -163,8 +187,10 @@ def plan_volume(
     )
 
 
-def _rungs(model: str, terms: int) -> list[tuple[str, tuple[int, int]]]:
+def _rungs(optics: VolumeOptics, model: str) -> list[tuple[str, tuple[int, int]]]:
     """Names, and (nodes across a pixel, neighbours; 0: rays), cheapest first."""
+    if not optics.separable:
+        return [(f"waves, {n} places a pixel", (n, 0)) for n in SHAPED]
     rays = [("rays", (RAYS, 0))]
     waves = [(f"waves, {j} neighbours", (nodes, j)) for j, nodes in WAVES]
     return {"auto": rays + waves, "ray": rays, "fresnel": waves}[model]
@@ -191,7 +217,8 @@ def _error(optics: VolumeOptics, candidate: tuple[int, int], depth: float) -> fl
     deeper = DEEPER if deepest > 1.01 * TRIED_BLUR * optics.object_pitch else 1.0
     reach = math.ceil(_blur(optics, depth) / optics.object_pitch) + 2
     tried = _column(optics, candidate, depth, reach)
-    truth = _column(optics, (FINEST[1], FINEST[0]), depth, reach)
+    finest = (FINEST[1], FINEST[0]) if optics.separable else (SHAPED_FINEST, 0)
+    truth = _column(optics, finest, depth, reach)
     return deeper * float(0.5 * np.abs(tried - truth).sum(dtype=float))
 
 
@@ -200,6 +227,8 @@ def _column(optics: VolumeOptics, rung: tuple[int, int], depth: float, reach: in
     """Light of a point off a lenslet's middle by a rung."""
     nodes, neighbours = rung
     place = 0.31 * optics.object_pitch, 0.17 * optics.object_pitch
+    if not optics.separable:
+        return ShapedPlane(optics, depth, reach, nodes).column(*place)[0]
     if neighbours == 0:
         return RayPlane(optics, depth, reach, nodes).column(*place)[0]
     settings = WaveSettings(
@@ -246,13 +275,16 @@ def _reach(optics: VolumeOptics, depth: float, lost: float) -> tuple[int, float]
 def unique_places(
     optics: VolumeOptics, samples: tuple[int, int], box: int
 ) -> list[tuple[int, int]]:
-    """Points (row, column) of a lenslet, of samples x box along each axis, from which symmetry
+    """Points (row, column) of a cell, of samples x box along each axis, from which symmetry
     gives all others.
     """
     rows, columns = (n * box for n in samples)
     if not optics.round:
         return [(i, j) for i in range(rows) for j in range(columns)]
-    turn = rows == columns and optics.pixels[0] == optics.pixels[1]
+    if optics.lattice == "hexagonal":
+        # half a turn
+        return [(i, j) for i in range(rows // 2) for j in range(columns)]
+    turn = rows == columns and optics.turnable
     return [
         (i, j)
         for i in range((rows + 1) // 2)
@@ -268,11 +300,15 @@ def _seconds(optics: VolumeOptics, plan: VolumePlan, rate: float) -> float:
         count = (plan.pixel_nodes * max(optics.pixels) + 1) ** 2
         per_plane = places * count * 4e-7
         return len(optics.lines) * per_plane * len(plan.reach)
+    if not optics.separable:
+        torus = [ShapedPlane(optics, 0.0, r, plan.pixel_nodes).places for r in plan.reach]
+        steps = sum(n * math.log2(n) for n in torus)
+        return len(optics.lines) * SHAPED_PRODUCTS * places * steps / rate
     modes = sampling(optics, plan.terms)[2].shape[1]
     window = (2 * plan.neighbours + 1) * modes
     rows, columns = (n * plan.pixel_nodes for n in optics.pixels)
     total = 0.0
     for reach in plan.reach:
-        lenslets, about = int(near(reach).sum()), 2 * plan.neighbours * (2 * reach + 1)
+        lenslets, about = int(near(reach, optics).sum()), 2 * plan.neighbours * (2 * reach + 1)
         total += 8.0 * rows * window * ((lenslets + about) * modes + lenslets * columns)
     return len(optics.lines) * OVERHEAD * places * total / rate

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -19,7 +20,8 @@ from plenocli.forward.volume.stack import plane_kernels
 class Recording:
     """Light on every superpixel, and the volume that gave it.
 
-    light: (lenslet_row, lenslet_column, pixel), sum of a voxel's value and the share of its light.
+    light: (row, column, pixel) of cells, of superpixels on a square lattice: sum of a voxel's value
+        and the share of its light.
     volume: (plane, row, column) mean values of the voxels that are inverted.
     """
 
@@ -60,7 +62,7 @@ def record(
     refine: int,
     progress: Callable[[int], None] | None = None,
 ) -> Recording:
-    """Light of a specimen on the superpixels of `count` lenslets about the axis.
+    """Light of a specimen on `count` cells of the array about the axis, lenslets of a square one.
 
     optics, plan: from `finer`.
     specimen: light at places from the axis, m.
@@ -69,8 +71,9 @@ def record(
     Raises NumericsError where memory does not suffice.
     """
     require_room(optics, plan, count)
-    places = tuple(places_along(n, s, optics.object_pitch) for n, s in zip(count, plan.samples))
-    light = np.zeros((*count, optics.pixels[0] * optics.pixels[1]))
+    along = zip(count, plan.samples, optics.object_cell)
+    places = tuple(places_along(n, s, size) for n, s, size in along)
+    light = np.zeros((*count, math.prod(optics.cell_pixels)))
     planes, layers = len(plan.reach), 1 if len(plan.reach) == 1 else refine
     shape = tuple(n * s // refine for n, s in zip(count, plan.samples))
     volume = np.zeros((planes // layers, *shape))
@@ -86,8 +89,8 @@ def record(
 
 
 def require_room(optics: VolumeOptics, plan: VolumePlan, count: tuple[int, int]) -> None:
-    """NumericsError where memory does not suffice to record before `count` lenslets."""
-    pixels = optics.pixels[0] * optics.pixels[1]
+    """NumericsError where memory does not suffice to record before `count` cells."""
+    pixels = math.prod(optics.cell_pixels)
     many = plan.samples[0] * plan.samples[1]
     widest = torus_for(count, (max(plan.reach),) * 2)
     per_plane = 4 * pixels * many * (2 * max(plan.reach) + 1) ** 2
@@ -102,7 +105,7 @@ def require_room(optics: VolumeOptics, plan: VolumePlan, count: tuple[int, int])
 def places_along(count: int, samples: int, pitch: float) -> np.ndarray:
     """Places (m) of all voxels along an axis.
 
-    count: of lenslets; samples: voxels of each; pitch: of the lenslets' images, m.
+    count: of cells; samples: voxels of each; pitch: of the cells' images, m.
     """
     return ((np.arange(count * samples) + 0.5) / samples - count / 2) * pitch
 
@@ -110,12 +113,13 @@ def places_along(count: int, samples: int, pitch: float) -> np.ndarray:
 def plane_light(
     optics: VolumeOptics, plan: VolumePlan, number: int, count: tuple[int, int], seen: np.ndarray
 ) -> np.ndarray:
-    """Light of one plane on every superpixel, (lenslet_row, lenslet_column, pixel).
+    """Light of one plane on every cell, (row, column, pixel).
 
     number: of the plane; seen: (row, column) light of its voxels.
     """
     kernels, offsets = plane_kernels(optics, plan, number)
-    torus = torus_for(count, (plan.reach[number],) * 2)
+    rows, columns = np.abs(offsets).max(axis=0).tolist()
+    torus = torus_for(count, (rows, columns))
     x = np.zeros((*torus, kernels.shape[2]), np.float32)
     s, t = plan.samples
     x[: count[0], : count[1]] = (

@@ -15,6 +15,7 @@ from plenocli.base.errors import NumericsError
 from plenocli.forward.propagation.accuracy_record import AccuracyRecord
 from plenocli.forward.volume.optics import VolumeOptics
 from plenocli.forward.volume.plan import VolumePlan, between_planes, unique_places
+from plenocli.forward.volume.shaped import ShapedPlane
 from plenocli.forward.volume.waves import near
 
 SUM_SLACK = 5e-3
@@ -31,14 +32,17 @@ class Stack:
 
     A: (entry, pixel, point) float32, share of a voxel's light that lands on a pixel.
     plane: (entry,) number of the plane; ascending.
-    lenslet_offset: (entry, 2) superpixel (row, column) relative to the voxel's own lenslet.
+    lenslet_offset: (entry, 2) superpixel (row, column) relative to the voxel's own lenslet; of
+        cells where these are two lenslets.
     depth: (plane,) m from the focused plane, away from the objective; of a photographic camera
         from its main lens.
     spacing: (plane, 2) m between voxels (rows, columns).
-    pixel_shape, point_shape: pixels of a superpixel, voxels of a lenslet (rows, columns).
+    pixel_shape, point_shape: pixels of a superpixel, voxels of a lenslet (rows, columns); of a
+        cell's two, one below the other, on a hexagonal lattice.
     wavelength: m.
     column_energy: (plane, point) share of the light on the superpixels kept.
     accuracy: how accurate the kernels are.
+    lattice: of the lenslets, "square" or "hexagonal".
     """
 
     A: np.ndarray
@@ -51,6 +55,12 @@ class Stack:
     wavelength: float
     column_energy: np.ndarray
     accuracy: AccuracyRecord
+    lattice: str = "square"
+
+    @property
+    def lenslets(self) -> int:
+        """Of a cell."""
+        return 2 if self.lattice == "hexagonal" else 1
 
     @property
     def reach(self) -> tuple[int, int]:
@@ -111,15 +121,14 @@ def build_stack(
 
     spread([(number,) for number in range(len(plan.reach))], one)
     planes = [found[number] for number in range(len(plan.reach))]
-    rows, columns = plan.samples
-    pitch = optics.object_pitch
+    voxel = [size / n for size, n in zip(optics.object_cell, plan.samples)]
     return Stack(
         A=np.concatenate([kernels for kernels, _ in planes]),
         plane=np.repeat(np.arange(len(planes)), [len(kernels) for kernels, _ in planes]),
         lenslet_offset=np.concatenate([offsets for _, offsets in planes]),
         depth=np.array(optics.places),
-        spacing=np.outer(optics.scales, [pitch / rows, pitch / columns]),
-        pixel_shape=optics.pixels,
+        spacing=np.outer(optics.scales, voxel),
+        pixel_shape=optics.cell_pixels,
         point_shape=plan.samples,
         wavelength=optics.wavelength,
         column_energy=np.stack([kernels.sum((0, 1), dtype=float) for kernels, _ in planes]),
@@ -133,6 +142,7 @@ def build_stack(
                 "halfway between planes": between_planes(optics, plan),
             },
         ),
+        lattice=optics.lattice,
     )
 
 
@@ -152,7 +162,8 @@ def plane_kernels(
     # voxels as well as places follow from a few
     wanted, sums = set(unique_places(optics, plan.samples, 1)), dict[tuple[int, int], np.ndarray]()
     for i, j in unique_places(optics, plan.samples, plan.box):
-        places = [((k + 0.5) / n - 0.5) * optics.object_pitch for k, n in zip((i, j), fine)]
+        cell = zip((i, j), fine, optics.object_cell)
+        places = [((k + 0.5) / n - 0.5) * size for k, n, size in cell]
         column, entered = lines[0].column(*places)
         for line in lines[1:]:
             other, also = line.column(*places)
@@ -163,13 +174,13 @@ def plane_kernels(
             voxel = a // plan.box, b // plan.box
             if voxel in wanted:
                 sums[voxel] = sums.get(voxel, 0) + image
-    kept = near(plan.reach[number])
-    offsets = np.argwhere(kept) - plan.reach[number]
-    kernels = np.empty((len(offsets), *optics.pixels, *plan.samples), np.float32)
+    kept = near(plan.reach[number], optics)
+    offsets = np.argwhere(kept) - np.array(kept.shape) // 2
+    kernels = np.empty((len(offsets), *optics.cell_pixels, *plan.samples), np.float32)
     for voxel, total in sums.items():
         for (a, b), image in _images(voxel, total, plan.samples, optics).items():
             kernels[..., a, b] = image.transpose(0, 2, 1, 3)[kept] / plan.box**2
-    return kernels.reshape(len(offsets), math.prod(optics.pixels), -1), offsets
+    return kernels.reshape(len(offsets), math.prod(optics.cell_pixels), -1), offsets
 
 
 def _images(
@@ -180,9 +191,11 @@ def _images(
     if not optics.round:
         return found
     (i, j), (rows, columns) = place, fine
+    if optics.lattice == "hexagonal":
+        return found | {(rows - 1 - i, columns - 1 - j): column[::-1, ::-1, ::-1, ::-1]}
     found |= {(rows - 1 - i, j): column[::-1, ::-1]}
     found |= {(a, columns - 1 - b): c[:, :, ::-1, ::-1] for (a, b), c in found.items()}
-    if rows == columns and optics.pixels[0] == optics.pixels[1]:
+    if rows == columns and optics.turnable:
         # a place on the diagonal is its own image
         turned = {(b, a): c.transpose(2, 3, 0, 1) for (a, b), c in found.items()}
         found = turned | found
@@ -198,7 +211,7 @@ def _guard(
     slack = max(SUM_SLACK, plan.error) if plan.model == "fresnel" else RAY_SLACK
     # pixels in part blind miss fringes, light is spread beyond the last superpixel, and in gaps
     # between lenslets some is lost
-    whole = optics.pixel_width == 1 and optics.open_width == optics.pitch
+    whole = optics.pixel_width == 1 and optics.gapless
     least = 1 - plan.lost[number] - slack - SPILLED
     if away > slack or (whole and (away < -slack - SPILLED or entered < least)):
         raise NumericsError(
@@ -213,8 +226,11 @@ def _working(optics: VolumeOptics, plan: VolumePlan) -> int:
     """Bytes at work on the deepest plane, beside the kernels."""
     lenslets = 2 * max(plan.reach) + 1
     rows, columns = (lenslets * n * plan.pixel_nodes for n in optics.pixels)
-    wide = (lenslets + 2 * plan.neighbours) * max(plan.terms, 1)
-    fields = 8 * (2 * rows * wide + 2 * wide**2 + rows * optics.pixels[1] * plan.pixel_nodes)
-    columns_of_plane = 4 * lenslets**2 * optics.pixels[0] * optics.pixels[1]
+    if optics.separable:
+        wide = (lenslets + 2 * plan.neighbours) * max(plan.terms, 1)
+        fields = 8 * (2 * rows * wide + 2 * wide**2 + rows * optics.pixels[1] * plan.pixel_nodes)
+    else:
+        fields = 32 * ShapedPlane(optics, 0.0, max(plan.reach), plan.pixel_nodes).places
+    columns_of_plane = 4 * near(max(plan.reach), optics).size * math.prod(optics.cell_pixels)
     voxels = len(unique_places(optics, plan.samples, 1)) + plan.samples[0] * plan.samples[1]
     return budget().threads * (fields + (2 + voxels) * columns_of_plane)

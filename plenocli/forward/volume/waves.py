@@ -12,6 +12,9 @@ from plenocli.forward.volume.arriving import ArrivingField
 from plenocli.forward.volume.lenslets import sampling, to_pixels
 from plenocli.forward.volume.optics import VolumeOptics
 
+TIPS = 0.15
+"""Pitches by which the tips of a hexagon stand out of its row."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class WaveSettings:
@@ -64,7 +67,7 @@ class WavePlane:
         window, nodes = (2 * s.neighbours + 1) * step, len(self._pixels[0])
         # a point on the diagonal: what is above it is what is below, transposed
         twin = y == x and o.round and o.pixels[0] == o.pixels[1]
-        wanted = near(s.reach) & (np.tri(self._half, dtype=bool) if twin else True)
+        wanted = near(s.reach, o) & (np.tri(self._half, dtype=bool) if twin else True)
         low, high = _ends(wanted.T)
         behind = np.empty((self._half * nodes, modes.shape[1]), np.complex64)
         for q in range(self._half):
@@ -96,16 +99,24 @@ class WavePlane:
         half = np.matmul(self._onto, field).reshape(n * step * n, count)
         both = (half @ self._onto.T / np.float32(o.magnification)).reshape(n * step, n * step)
         light = (np.abs(both.reshape(n, step, n, step)) ** 2).sum((1, 3))
-        entered = float(light[near(s.reach)].sum(dtype=float))
+        entered = float(light[near(s.reach, o)].sum(dtype=float))
         return np.pad(both, s.neighbours * step), entered
 
 
-def near(reach: int) -> np.ndarray:
-    """(row, column) of the superpixels about a lenslet: where light lands no farther than `reach`
-    pitches from a point that is somewhere before it.
+def near(reach: int, optics: VolumeOptics) -> np.ndarray:
+    """(row, column) of the superpixels, or cells, about one: where light lands no farther than
+    `reach` pitches from a point that is somewhere before it.
     """
-    least = np.maximum(np.abs(np.arange(-reach, reach + 1)) - 1, 0)
-    return np.hypot(least[:, None], least) < max(reach, 1)
+    many = len(optics.sites)
+    high = many * optics.row_spacing
+    # lenslets of a cell stand out of it by half of its shift
+    out = (0.0, 0.0) if many == 1 else (TIPS, 0.25)
+    far = math.ceil((reach + out[0]) / high), reach + math.ceil(out[1])
+    apart = [
+        np.maximum(np.abs(np.arange(-n, n + 1)) * size - size - beside, 0)
+        for n, size, beside in zip(far, (high, 1.0), out)
+    ]
+    return np.hypot(apart[0][:, None], apart[1]) < max(reach, 1)
 
 
 def _ends(wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -12,13 +12,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from plenocli.base.errors import InputError
-from plenocli.forward.camera.quadrature import gauss
 from plenocli.forward.volume.optics import VolumeOptics
+from plenocli.forward.volume.shaped import Grating
 
 RINGS = 16
 """Rings that are fitted."""
 FINE = 6
 """Directions across a pixel."""
+PLACES = 3
+"""Places across a pixel, at which light is followed."""
 SMOOTH = 0.5
 """Weight of the rings' second differences, over that of the white image."""
 FAINT = 0.02
@@ -89,39 +91,29 @@ def _alike(a: np.ndarray, b: np.ndarray) -> float:
 def _patterns(optics: VolumeOptics, radii: np.ndarray) -> np.ndarray:
     """(ring, row, column) white superpixel that a ring of intensity 1 makes; between rings
     intensity is linear.
-    """
-    to_pixels = [_from_directions(optics, axis, radii[-1]) for axis in (0, 1)]
-    y, x = (directions for directions, _ in to_pixels)
-    s = np.hypot(y[:, None], x)
-    found = []
-    for ring in range(len(radii)):
-        hat = np.interp(s, radii, np.arange(len(radii)) == ring, right=0.0)
-        found.append(to_pixels[0][1] @ hat @ to_pixels[1][1].T)
-    return np.array(found)
 
-
-def _from_directions(
-    optics: VolumeOptics, axis: int, aperture: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Directions along an axis and what each puts on the pixels (pixel, direction) of all
-    superpixels, one on another.
+    Light from one direction is a plane wave, and the array a grating: its orders go on in
+    directions of their own, and interfere on the pixels.
     """
-    pixels = optics.pixels[axis]
-    steps = FINE * pixels
-    directions = ((np.arange(steps) + 0.5) / steps * 2 - 1) * aperture
-    size = optics.pitch * optics.widening / pixels
-    nodes, _ = optics.pixel_nodes(3, axis)
-    # what falls on the neighbours' pixels comes from them likewise
-    several = np.arange(-2, 3) * pixels * size
-    t = several[:, None, None] + nodes
-    u, w = gauss(64)
-    half = optics.open_width / 2
-    left = 1 / optics.sensor_distance + 1 / optics.pupil_distance - 1 / optics.focal_length
-    lens = w * np.exp(0.5j * optics.k * left * (half * u) ** 2)
-    to_middle = optics.sensor_distance * directions / optics.magnification
-    light = np.zeros((pixels, steps))
-    for place in t:
-        away = place.reshape(-1, 1) - to_middle
-        field = np.exp(-1j * optics.k / optics.sensor_distance * half * away[..., None] * u) @ lens
-        light += (np.abs(field) ** 2).reshape(pixels, -1, steps).mean(axis=1)
-    return directions, light
+    from scipy.fft import ifft2
+
+    array = Grating(optics, PLACES)
+    series = array.through[0].astype(np.complex64)
+    down, right = (
+        ((np.arange(FINE * n) + 0.5) / (FINE * n) * 2 - 1) * radii[-1] for n in optics.pixels
+    )
+    to_rows, to_columns = (
+        array.propagation(array.orders(axis) + optics.k / optics.magnification * s[:, None])
+        for axis, s in enumerate((down, right))
+    )
+    found = np.zeros((len(radii), *series.shape))
+    for s, rows in zip(down, to_rows):
+        inside = np.hypot(s, right) < radii[-1]
+        field = ifft2(series * rows[:, None] * to_columns[inside, None], axes=(1, 2))
+        hats = [
+            np.interp(np.hypot(s, right[inside]), radii, np.arange(len(radii)) == ring)
+            for ring in range(len(radii))
+        ]
+        found += np.tensordot(hats, field.real**2 + field.imag**2, 1)
+    whole = np.array([array.on_pixels(one)[0, :, 0] for one in found])
+    return whole[:, : optics.pixels[0]]

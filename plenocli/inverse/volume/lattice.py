@@ -66,7 +66,7 @@ def lattice_of(torus: tuple[int, int], voxels: Voxels) -> Lattice:
         times[:, -1] = 1
     return Lattice(
         mixing=mixing.reshape(-1, points, points),
-        lateral=np.hypot(turns[..., 0], turns[..., 1]) / voxels.pitch,
+        lateral=np.hypot(turns[..., 0] / voxels.row_spacing, turns[..., 1]) / voxels.pitch,
         turns=turns,
         times=times.ravel(),
     )
@@ -128,8 +128,9 @@ def voxels_of(stack: Stack) -> Voxels:
     # layers of a photographic camera are told apart by parallax, not by their distance
     return Voxels(
         point_shape=stack.point_shape,
-        pitch=float(np.mean(stack.spacing)),
+        pitch=float(np.mean(stack.spacing[:, 1])),
         depths=tuple((stack.depth - stack.depth[0]).tolist()),
+        row_spacing=float(stack.spacing[0, 0] / stack.spacing[0, 1]),
     )
 
 

@@ -57,13 +57,15 @@ class Voxels:
     """The fine lattice: unknown = plane * points + row of a lenslet's points * columns + column.
 
     point_shape: (rows, columns) of points in a lenslet.
-    pitch: spacing of points, m.
+    pitch: spacing of columns of points, m.
     depths: (plane,) m, in order.
+    row_spacing: of rows of points, in pitches.
     """
 
     point_shape: tuple[int, int]
     pitch: float
     depths: tuple[float, ...]
+    row_spacing: float = 1.0
 
     @property
     def unknowns(self) -> int:

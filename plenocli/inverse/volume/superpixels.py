@@ -10,7 +10,9 @@ import numpy as np
 
 from plenocli.base.errors import InputError
 from plenocli.base.text import by
-from plenocli.base.tiling import to_blocks
+from plenocli.base.tiling import in_cells, in_lenslets
+from plenocli.forward.camera.model import ROW_SPACING
+from plenocli.forward.sensor.capture import SuperpixelGrid
 from plenocli.forward.sensor.frames import saturated
 from plenocli.forward.sensor.superpixel import extract
 from plenocli.inverse.calibration.calibration import there
@@ -19,33 +21,34 @@ from plenocli.inverse.volume.measurement import Measurement
 
 if TYPE_CHECKING:
     from plenocli.forward.sensor.capture import Capture
+    from plenocli.forward.volume.stack import Stack
     from plenocli.inverse.calibration.calibration import Calibration
 
 EDGE = 0.1
 """Of the brightest pixel of white, below which one at the pupil's edge counts for nothing."""
+MOST_TURN = 3.0
+"""Degrees by which superpixels may be turned."""
 DIM = 0.05
 """Of the usual white level, below which a lenslet counts for nothing."""
 
 
 def measured(
     capture: Capture,
-    shape: tuple[int, int],
+    stack: Stack,
     calibration: Calibration | None = None,
     *,
     where: str | Path | None = None,
     background: float = 0.0,
-    even: np.ndarray | None = None,
 ) -> Measurement:
     """Superpixels of a capture, one unit of light the mean level of the white image, or what the
     capture calls one.
 
-    shape: (rows, columns) of a superpixel in the kernels.
-    calibration: with grid, white and dark, along which real captures are resampled; None: the
-        capture is tiled as it says itself.
+    stack: the kernels, which say how many pixels superpixels have, and on what lattice.
+    calibration: with grid, white and dark, along which real captures are resampled; where the white
+        image shows another light than the kernels have of an even object, pixels are made what they
+        would be behind the camera that is described. None: the capture is tiled as it says itself.
     where: the calibration's file, for messages.
     background: light without any specimen, in the same unit.
-    even: (pixel,) light of an even object by the kernels: where the white image of a real capture
-        shows another, pixels are made what they would be behind the camera that is described.
 
     Raises InputError where sizes disagree or lenslets are missing.
     """
@@ -55,13 +58,21 @@ def measured(
             capture.metadata.path,
             "use a monochrome camera",
         )
+    several = stack.lenslets
+    shape = stack.pixel_shape[0] // several, stack.pixel_shape[1]
     if calibration is None:
-        found = _tiled(capture, shape)
+        found = _tiled(capture, shape, stack.lattice)
     else:
-        found = _resampled(capture, shape, calibration, where)
-        if even is not None:
-            found = _evened(found, white_superpixel(calibration, shape).ravel(), even)
-    return replace(found, background=background)
+        found = _resampled(capture, shape, stack.lattice, calibration, where)
+        even = in_lenslets(stack.even()[None, None], several).mean(axis=(0, 1))
+        found = _evened(found, white_superpixel(calibration, shape, stack.lattice).ravel(), even)
+    usable = np.ones(found.signal.shape, bool) if found.usable is None else found.usable
+    return replace(
+        found,
+        signal=in_cells(found.signal, several),
+        usable=in_cells(usable, several),
+        background=background,
+    )
 
 
 def _evened(found: Measurement, white: np.ndarray, even: np.ndarray) -> Measurement:
@@ -73,10 +84,12 @@ def _evened(found: Measurement, white: np.ndarray, even: np.ndarray) -> Measurem
     return replace(found, signal=found.signal * factor, usable=usable & known)
 
 
-def white_superpixel(calibration: Calibration, shape: tuple[int, int]) -> np.ndarray:
+def white_superpixel(
+    calibration: Calibration, shape: tuple[int, int], lattice: str = "square"
+) -> np.ndarray:
     """Mean superpixel (row, column) of the white image, resampled to `shape`.
 
-    Raises InputError where the calibration has no white image.
+    Raises InputError where the calibration has no white image, or another lattice.
     """
     white = calibration.white
     if white is None or white.flat is None:
@@ -88,30 +101,37 @@ def white_superpixel(calibration: Calibration, shape: tuple[int, int]) -> np.nda
         np.where(np.isfinite(white.flat), white.flat, np.nan),
         grid.centres[grid.valid],
         shape,
-        _step(calibration, shape),
+        _step(calibration, shape, lattice),
     )
     return np.nan_to_num(np.nanmean(known, axis=0)).reshape(shape)
 
 
-def _step(calibration: Calibration, shape: tuple[int, int]) -> tuple[float, float]:
+def _step(calibration: Calibration, shape: tuple[int, int], lattice: str) -> tuple[float, float]:
     """Pixels of the sensor between those of the kernels (rows, columns).
 
-    Raises InputError for another lattice than a square one.
+    Raises InputError for another lattice than that of the kernels.
     """
-    if calibration.grid.lattice != "square":
+    grid = calibration.grid
+    if grid.lattice != lattice:
         raise InputError(
-            f"holds a {calibration.grid.lattice} lattice; volumes are those of square lenslets",
+            f"holds a {grid.lattice} lattice, the kernels are those of a {lattice} one",
             "calibration",
-            "demux such a capture, or take an array of square lenslets",
+            "describe the camera as it is: lenslet_array.lattice",
         )
-    rows, columns = (float(p) / n for p, n in zip(calibration.grid.pitch, shape))
-    return rows, columns
+    if abs(grid.angle) > MOST_TURN:
+        raise InputError(
+            f"holds a lattice turned by {grid.angle:.2g} degrees",
+            "calibration",
+            "turn white image and captures so that rows of lenslets follow those of pixels",
+        )
+    high = ROW_SPACING if lattice == "hexagonal" else 1.0
+    return float(grid.pitch[0]) * high / shape[0], float(grid.pitch[1]) / shape[1]
 
 
-def _tiled(capture: Capture, shape: tuple[int, int]) -> Measurement:
+def _tiled(capture: Capture, shape: tuple[int, int], lattice: str) -> Measurement:
     path = capture.metadata.path
-    own = capture.grid.shape if capture.grid else None
-    if own is None:
+    own, count = (capture.grid.shape, capture.grid.count) if capture.grid else (None, None)
+    if own is None or count is None:
         raise InputError(
             "does not say where its lenslets are",
             path,
@@ -129,23 +149,34 @@ def _tiled(capture: Capture, shape: tuple[int, int]) -> Measurement:
     noise, usable = capture.noise, np.isfinite(signal)
     if np.isfinite(capture.levels.white):
         usable &= ~saturated(capture.mosaic, capture.levels.black, capture.levels.white)
+    # whole pixels side by side
+    rows, columns = count
+    centre = there(SuperpixelGrid.tiled((rows, columns), shape, lattice).centre)
+    origin = np.rint(centre - (np.array(shape) - 1) / 2).astype(int)
+    cut = extract(np.where(usable, signal, np.nan), origin, shape)
+    known = np.isfinite(cut)
     return Measurement(
-        signal=to_blocks(np.where(usable, signal, 0.0), shape) / unit,
+        signal=np.where(known, cut, 0.0) / unit,
         read_variance=0.0 if noise is None else noise.without_signal / unit**2,
         gain=0.0 if noise is None else noise.gain / unit,
-        usable=to_blocks(usable, shape),
+        usable=known,
     )
 
 
 def _resampled(
-    capture: Capture, shape: tuple[int, int], calibration: Calibration, where: str | Path | None
+    capture: Capture,
+    shape: tuple[int, int],
+    lattice: str,
+    calibration: Calibration,
+    where: str | Path | None,
 ) -> Measurement:
     grid, white = calibration.grid, calibration.white
-    step = _step(calibration, shape)
+    step = _step(calibration, shape, lattice)
     if max(abs(s - 1) for s in step) > 0.1:
+        rows, columns = (s * n for s, n in zip(step, shape))
         raise InputError(
-            f"has lenslets {by(np.round(grid.pitch, 3).tolist())} pixels apart, the kernels "
-            f"{by(shape)} pixels a lenslet",
+            f"has lenslets {rows:.4g} x {columns:.4g} pixels apart, the kernels {by(shape)} pixels "
+            "a lenslet",
             where,
             "describe the camera with sensor.pixels_per_lenslet as measured, to the nearest pixel",
         )

@@ -99,8 +99,11 @@ class _Descent:
         lattice = lattice_of(op.torus, problem.voxels)
         scale = float(np.sqrt(lattice.mean(power))) or 1.0
         self.scale = (whitening / scale).astype(op.dtype)
-        self.along = (problem.voxels.pitch / np.diff(problem.voxels.depths)).astype(op.dtype)
-        self.solve = op.device.put(_inverses(problem, lattice, self.scale, self.along))
+        voxels = problem.voxels
+        self.along = (voxels.pitch / np.diff(voxels.depths)).astype(op.dtype)
+        self.down = op.dtype.type(1 / voxels.row_spacing)
+        steps = _inverses(problem, lattice, self.scale, self.along, float(self.down))
+        self.solve = op.device.put(steps)
         rows, columns = op.range.shape[:2]
         self.y = np.zeros(self.whole.range.shape, op.dtype)
         self.counts = np.zeros(self.whole.range.shape, op.dtype)
@@ -114,7 +117,7 @@ class _Descent:
         planes, (rows, columns) = len(self.problem.voxels.depths), self.whole.torus
         s, t = self.problem.voxels.point_shape
         u = np.zeros((planes, rows * s, columns * t), self.whole.dtype)
-        v = differences(u, self.along)
+        v = differences(u, self.along, self.down)
         return _State(
             w=self.y,
             v=v,
@@ -137,7 +140,8 @@ class _Descent:
     def _round(self, state: _State, strength: np.floating) -> _State:
         whole, voxels = self.whole, self.problem.voxels
         kind = whole.dtype.type
-        pull = back_differences(tuple(v - d for v, d in zip(state.v, state.of_v)), self.along)
+        left = tuple(v - d for v, d in zip(state.v, state.of_v))
+        pull = back_differences(left, self.along, self.down)
         pull = kind(PENALTY) * pull + kind(SIGN) * (state.u - state.of_u)
         pull = voxels.lenslets(pull)
         data = whole.to_frequencies((state.w - state.of_w) * self.scale)
@@ -146,7 +150,7 @@ class _Descent:
         light = whole.from_frequencies(whole.at_frequencies(of_x)) * self.scale
         aim = _beyond(light, state.w) + state.of_w
         w = (self.counts * self.y + aim) / (self.counts + 1)
-        steps = zip(differences(x, self.along), state.v, state.of_v)
+        steps = zip(differences(x, self.along, self.down), state.v, state.of_v)
         aims = tuple(_beyond(g, v) + d for g, v, d in steps)
         v = shrunk(aims, strength / kind(PENALTY))
         above = _beyond(x, state.u) + state.of_u
@@ -162,19 +166,19 @@ class _Descent:
         )
 
 
-def differences(x: np.ndarray, along: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Of (plane, row, column) with the next plane, times `along` (plane - 1,), and with the next
-    row, column on the torus.
+def differences(x: np.ndarray, along: np.ndarray, down: float = 1.0) -> tuple[np.ndarray, ...]:
+    """Of (plane, row, column) with the next plane, times `along` (plane - 1,), with the next row on
+    the torus, times `down`, and with the next column.
     """
     deep = along[:, None, None] * np.diff(x, axis=0)
-    return deep, np.roll(x, -1, 1) - x, np.roll(x, -1, 2) - x
+    return deep, down * (np.roll(x, -1, 1) - x), np.roll(x, -1, 2) - x
 
 
-def back_differences(v: tuple[np.ndarray, ...], along: np.ndarray) -> np.ndarray:
+def back_differences(v: tuple[np.ndarray, ...], along: np.ndarray, down: float = 1.0) -> np.ndarray:
     """The adjoint of `differences`."""
-    deep, down, right = v
+    deep, rows, right = v
     deep = along[:, None, None] * deep
-    x = np.roll(down, 1, 1) - down + np.roll(right, 1, 2) - right
+    x = down * (np.roll(rows, 1, 1) - rows) + np.roll(right, 1, 2) - right
     x[1:] += deep
     x[:-1] -= deep
     return x
@@ -194,7 +198,7 @@ def _beyond(new: np.ndarray, old: np.ndarray) -> np.ndarray:
 
 
 def _inverses(
-    problem: Problem, lattice: Lattice, scale: np.ndarray, along: np.ndarray
+    problem: Problem, lattice: Lattice, scale: np.ndarray, along: np.ndarray, down: float
 ) -> np.ndarray:
     """(A' A + p D' D + q)^-1 of every frequency, (frequency, unknown, unknown), made in double
     precision and stored as the map is.
@@ -209,7 +213,7 @@ def _inverses(
     step = along[:, None] * np.diff(np.eye(planes), axis=0)
     axial = np.kron(np.eye(points), PENALTY * step.T @ step)
     independent = np.broadcast_to(np.eye(planes), (points, planes, planes))
-    across = (4 * np.sin(np.pi * lattice.turns) ** 2).sum(axis=-1)
+    across = 4 * np.sin(np.pi * lattice.turns) ** 2 @ [down**2, 1.0]
     diagonal = np.diag_indices(unknowns)
 
     with bar(None, frequencies, "steps") as shown:

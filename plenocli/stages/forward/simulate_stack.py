@@ -26,11 +26,13 @@ class StackSummary:
     """What simulate-pif planned, or wrote, for a volume.
 
     output: None for a plan.
+    samples: voxels (rows, columns) of a lenslet.
     between_planes: share of a point's light elsewhere, halfway between planes, than interpolated.
     """
 
     output: str | None
     plan: VolumePlan
+    samples: tuple[int, int]
     between_planes: float
 
     def as_json(self) -> dict[str, Any]:
@@ -39,7 +41,7 @@ class StackSummary:
         return {
             "output": self.output,
             "planes": len(plan.reach),
-            "samples": list(plan.samples),
+            "samples": list(self.samples),
             "rung": plan.rung,
             "accuracy": plan.asked,
             "estimated_accuracy": plan.error,
@@ -57,7 +59,7 @@ class StackSummary:
 
         plan = self.plan
         text = (
-            f"kernels of {len(plan.reach)} planes, {by(plan.samples)} voxels a lenslet, light of "
+            f"kernels of {len(plan.reach)} planes, {by(self.samples)} voxels a lenslet, light of "
             f"{min(plan.reach)} to {max(plan.reach)} lenslets on each side "
             f"({max(plan.lost):.1%} or less beyond them); "
             f"{plan.rung}, {plan.error:.1g} of a voxel's light is elsewhere"
@@ -134,7 +136,7 @@ def run_simulate_stack(
     plan = plan_volume(optics, samples, accuracy=asked, model=model)
     between = between_planes(optics, plan)
     if explain or output is None:
-        return StackSummary(output=None, plan=plan, between_planes=between)
+        return StackSummary(output=None, plan=plan, samples=samples, between_planes=between)
     if plan.seconds > LONG:
         note(f"about {plan.seconds:.2g} s on one core for {len(plan.reach)} planes ({plan.rung})")
     with (
@@ -149,7 +151,7 @@ def run_simulate_stack(
         accuracy=stack.accuracy.as_json(),
     )
     write_artefact(output, stack_artefact(stack, provenance), overwrite=overwrite)
-    return StackSummary(output=str(output), plan=plan, between_planes=between)
+    return StackSummary(output=str(output), plan=plan, samples=samples, between_planes=between)
 
 
 def _with_measured_pupil(microscope: Microscope, calibration: Path | str) -> Microscope:
@@ -160,7 +162,8 @@ def _with_measured_pupil(microscope: Microscope, calibration: Path | str) -> Mic
     from plenocli.inverse.volume.superpixels import white_superpixel
 
     optics = optics_of(microscope)
-    white = white_superpixel(read_calibration(calibration, response=False), optics.pixels)
+    known = read_calibration(calibration, response=False)
+    white = white_superpixel(known, optics.pixels, optics.lattice)
     found = pupil_rings(white, optics)
     note(
         f"the white image shows a pupil that reaches NA {found.aperture:.3g} (correlation "

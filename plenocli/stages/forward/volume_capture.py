@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from plenocli.base.errors import InputError, UsageError
+from plenocli.base.errors import ConfigError, InputError, UsageError
 from plenocli.base.progress import bar, note
 from plenocli.stages.forward.capture_settings import CaptureSummary, Settings
 from plenocli.stages.forward.simulate_stack import DEFAULT_ACCURACY, LONG
@@ -124,32 +124,60 @@ def run_volume_capture(
 
 def _of_specimen(path: str | Path, settings: Settings, volume: str) -> _Recorded:
     """A specimen before an objective."""
+    from plenocli.base.tiling import in_lenslets
     from plenocli.files.config.microscope_file import load_microscope, microscope_toml
     from plenocli.forward.volume.cameras import optics_of
     from plenocli.forward.volume.recording import finer, record
 
     microscope = load_microscope(path)
+    _require_raster(microscope, path)
     coarse = optics_of(microscope)
     specimen = _specimen(volume, microscope, coarse, settings.seed)
     samples = microscope.object.samples_per_lenslet
     optics, plan = finer(
         coarse, samples, settings.refine, settings.accuracy or DEFAULT_ACCURACY, settings.model
     )
+    rows, columns = microscope.lenslet_array.count
+    many = len(coarse.sites)
     with _shown(plan) as progress:
-        found = record(
-            optics, plan, microscope.lenslet_array.count, specimen, settings.refine, progress
-        )
-    spacing = [coarse.object_pitch / n for n in samples]
+        cells = -(-rows // many), columns
+        found = record(optics, plan, cells, specimen, settings.refine, progress)
+    spacing = [
+        coarse.row_spacing * coarse.object_pitch / samples[0],
+        coarse.object_pitch / samples[1],
+    ]
     return _Recorded(
         camera=microscope,
         config=microscope_toml(microscope),
-        light=found.light,
+        light=in_lenslets(found.light, many)[:rows],
         volume=found.volume,
         depth=np.array(coarse.depths),
         spacing=np.tile(spacing, (len(coarse.depths), 1)),
         plan=plan,
         files={"volume": None if volume.startswith("phantom:") else volume},
     )
+
+
+def _require_raster(microscope: Microscope, where: str | Path) -> None:
+    """ConfigError unless superpixels of whole pixels tile the sensor."""
+    columns = microscope.sensor.pixels_per_lenslet[1]
+    if microscope.lenslet_array.lattice == "hexagonal" and columns % 2:
+        raise ConfigError(
+            f"every other row of a hexagonal lattice stands half of {columns} pixels aside",
+            where,
+            "simulate with an even number of pixels_per_lenslet in columns",
+        )
+
+
+def _aside(mosaic: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """A mosaic of superpixels (rows, columns) with every other row of them half of one to the
+    right; what is beside the rows is dark.
+    """
+    half = shape[1] // 2
+    rows = mosaic.reshape(-1, shape[0], mosaic.shape[1])
+    out = np.zeros((*rows.shape[:2], mosaic.shape[1] + half))
+    out[::2, :, :-half], out[1::2, :, half:] = rows[::2], rows[1::2]
+    return out.reshape(mosaic.shape[0], -1)
 
 
 def _of_layers(
@@ -169,6 +197,12 @@ def _of_layers(
     distances = tuple(distance for _, distance in pictures)
     if len(set(distances)) < len(distances):
         raise UsageError("two layers stand at one distance", "--layer", "draw them as one picture")
+    if (camera.lenslet_array.lattice, camera.lenslet_array.aperture_shape) != ("square", "square"):
+        raise ConfigError(
+            "layers are recorded behind square lenslets on a square lattice",
+            path,
+            "leave layers out, or take such lenslets",
+        )
     planes = camera.object.model_copy(update={"planes": distances})
     optics = optics_of_camera(camera.model_copy(update={"object": planes}))
     refine, samples, count = (
@@ -299,7 +333,7 @@ def _specimen(volume: str, microscope: Microscope, optics: VolumeOptics, seed: i
     depths, pitch = optics.depths, optics.object_pitch
     rows, columns = microscope.lenslet_array.count
     deep = (depths[-1] - depths[0]) / 2 if len(depths) > 1 else pitch
-    half = (deep, rows * pitch / 2, columns * pitch / 2)
+    half = (deep, rows * optics.row_spacing * pitch / 2, columns * pitch / 2)
     region = Region(half=half, middle=(depths[0] + depths[-1]) / 2, unit=pitch)
     return phantom(name, region, seed)
 
@@ -355,7 +389,10 @@ def _detected(
             "puts no light on the sensor", name, "give a volume within the planes and the field"
         )
     # rounding of transforms leaves dark pixels below zero
+    lattice = camera.lenslet_array.lattice
     mosaic = to_plane(np.maximum(light, 0), sensor.pixels_per_lenslet) * sensor.quantum_efficiency
+    if lattice == "hexagonal":
+        mosaic = _aside(mosaic, sensor.pixels_per_lenslet)
     scale = None
     if settings.snr_db is None and settings.noise != "none":
         usual = camera.light.white_exposure
@@ -364,6 +401,6 @@ def _detected(
         scale = ExposureScale(full * seconds / usual, seconds)
     stage = "capture-sim of a volume"
     capture, saturated = recorded(sensor, mosaic, settings.options, name, scale, stage)
-    grid = SuperpixelGrid.tiled(camera.lenslet_array.count, sensor.pixels_per_lenslet)
+    grid = SuperpixelGrid.tiled(camera.lenslet_array.count, sensor.pixels_per_lenslet, lattice)
     about = replace(capture.metadata, target=Path(name).name)
     return replace(capture, grid=grid, metadata=about), saturated

@@ -103,16 +103,15 @@ def run_volume(
     shot = read_capture(capture)
     measurement = measured(
         shot,
-        stack.pixel_shape,
+        stack,
         known,
         where=calibration,
         background=0.0 if background == "auto" else background,
-        even=stack.even(),
     )
-    rows, columns = measurement.signal.shape[:2]
+    (rows, columns), several = measurement.signal.shape[:2], stack.lenslets
     note(
-        f"{rows} x {columns} lenslets, {len(stack.depth)} planes of {stack.point_shape[0]} x "
-        f"{stack.point_shape[1]} voxels a lenslet"
+        f"{rows * several} x {columns} lenslets, {len(stack.depth)} planes of "
+        f"{stack.point_shape[0] // several} x {stack.point_shape[1]} voxels a lenslet"
     )
     trials: tuple[Trial, ...] = ()
     how: dict[str, Any] = dict(hold_out=hold_out, seed=seed, where=pif, device=there)

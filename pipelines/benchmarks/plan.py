@@ -141,15 +141,15 @@ class Brute:
         )
         return system, time.process_time() - start
 
-    def invert(self, system, inversion, data, truth):
+    def invert(self, system, method, data, truth):
         """(PSNR in dB, seconds) of a method, everything made anew."""
         start = time.process_time()
-        options = Options(method=inversion.method, nnls_iterations=inversion.iterations)
+        options = Options(method=method)
         estimators = Estimators(system, options, self.read_pictures)
         loud = float(np.sqrt(np.mean(np.square(data.y))))
         limits = what_limits(data.sigma / loud, system.accuracy)
         off = 0.0 if limits is None or limits.limited_by == "noise" else limits.model_error
-        found, _ = estimate(estimators, METHODS[inversion.method], data, model_error=off)
+        found, _ = estimate(estimators, METHODS[method], data, model_error=off)
         spent = time.process_time() - start
         spent += self.reading if estimators.prior.pictures_of else 0.0
         error = np.mean(np.square(found.value.reshape(truth.shape) - truth))
@@ -169,22 +169,22 @@ def run_sized(name, lenslets):
         capture = simulate_capture(camera, brute.source, brute.picture, coarse, name=brute.scene)
         data = superpixels(capture.capture, system)
         truth = to_blocks(np.asarray(capture.scene[0], float), system.object_shape)
-        for inversion in INVERSIONS:
-            db, spent = brute.invert(system, inversion, data, truth)
-            rows.append(row_of(camera, option, inversion, db, making, spent))
+        for method in INVERSIONS:
+            db, spent = brute.invert(system, method, data, truth)
+            rows.append(row_of(camera, option, method, db, making, spent))
     return {"case": f"{name} {lenslets}", "rows": rows, "plans": []}
 
 
-def row_of(camera, option, inversion, db, making, spent):
+def row_of(camera, option, method, db, making, spent):
     """What a chain gave and took, with what its costs are counted by."""
     lenslets = int(np.prod(camera.lenslet_array.count))
     return {
-        "chain": name_of(option, inversion),
+        "chain": name_of(option, method),
         "psnr": db,
         "making": making,
         "inverting": spent,
-        "method": inversion.method,
-        "features": costs.Effort.of(option.plan, lenslets).features(inversion.iterations),
+        "method": method,
+        "features": costs.Effort.of(option.plan, lenslets).features(),
         "matrix features": costs.matrix_features(option.plan),
     }
 
@@ -199,30 +199,30 @@ def run_case(kind, number):
     capture = brute.capture(finest.accuracy, wide)
     probes, by_method = {}, {}
 
-    def hopeless(option, inversion):
+    def hopeless(option, method):
         """Whether a chain need not be run, as its matrix or its method loses too much."""
-        if inversion == PROBE or wide == (1, 1) or option is finest:
+        if method == PROBE or wide == (1, 1) or option is finest:
             return False
         if option.own_only and probes[option] < max(probes.values()) - HOPELESS:
             return True
         best = max(by_method.values())
-        return by_method.get(inversion, best) < best - HOPELESS / 2
+        return by_method.get(method, best) < best - HOPELESS / 2
 
     for option in sorted(matrices, key=lambda m: (-m.superpixels[0], m is not finest)):
         system, making = brute.matrix(option)
         data = superpixels(capture.capture, system)
         truth = to_blocks(np.asarray(capture.scene[0], float), system.object_shape)
-        for inversion in sorted(INVERSIONS, key=lambda i: i != PROBE):
-            if inversion.method == "block-mean" and not option.own_only and wide != (1, 1):
+        for method in sorted(INVERSIONS, key=lambda i: i != PROBE):
+            if method == "block-mean" and not option.own_only and wide != (1, 1):
                 continue
-            if hopeless(option, inversion):
+            if hopeless(option, method):
                 continue
-            db, spent = brute.invert(system, inversion, data, truth)
-            if inversion == PROBE:
+            db, spent = brute.invert(system, method, data, truth)
+            if method == PROBE:
                 probes[option] = db
             if option is finest:
-                by_method[inversion] = db
-            rows.append(row_of(camera, option, inversion, db, making, spent))
+                by_method[method] = db
+            rows.append(row_of(camera, option, method, db, making, spent))
     start = time.process_time()
     rehearsal = Rehearsal(
         camera,
@@ -246,10 +246,10 @@ def run_case(kind, number):
         "plans": [
             {
                 "allowed": plan.allowed,
-                "chosen": name_of(plan.chosen.chain.matrix, plan.chosen.chain.inversion),
+                "chosen": name_of(plan.chosen.chain.matrix, plan.chosen.chain.method),
                 "runs": plan.runs,
                 "predicted": {
-                    name_of(w.chain.matrix, w.chain.inversion): [w.loss, w.rehearsed]
+                    name_of(w.chain.matrix, w.chain.method): [w.loss, w.rehearsed]
                     for w in plan.weighed
                 },
             }
@@ -258,10 +258,10 @@ def run_case(kind, number):
     }
 
 
-def name_of(option, inversion):
+def name_of(option, method):
     """A chain in words, the same in all records."""
     rows, columns = option.superpixels
-    return f"{option.model} {option.accuracy:g} {rows}x{columns} {inversion.name}"
+    return f"{option.model} {option.accuracy:g} {rows}x{columns} {method}"
 
 
 def judged(record, plan):

@@ -27,26 +27,7 @@ COARSER = 6
 """Doublings of the finest accuracy that are tried where it cannot be reached."""
 
 
-@dataclass(frozen=True)
-class Inversion:
-    """A method of reconstruct, with its steps where it takes a number of them."""
-
-    method: str
-    iterations: int | None = None
-
-    @property
-    def name(self) -> str:
-        """As people read it."""
-        return self.method if self.iterations is None else f"{self.method}, {self.iterations} steps"
-
-
-INVERSIONS = (
-    Inversion("block-mean"),
-    Inversion("tikhonov"),
-    Inversion("lmmse"),
-    Inversion("tv"),
-    Inversion("pnp"),
-)
+INVERSIONS = ("block-mean", "tikhonov", "lmmse", "tv", "pnp")
 """The methods that are considered: those that need nothing but a matrix and the photographs that
 come along.
 """
@@ -80,7 +61,7 @@ class Chain:
     """
 
     matrix: MatrixOption
-    inversion: Inversion
+    method: str
     seconds: float
     bytes: int
 
@@ -90,13 +71,10 @@ class Chain:
         camera, capture: files as a shell reads them.
         """
         rows, columns = self.matrix.superpixels
-        steps = self.inversion.iterations
         return [
             f"plenocli simulate-pif {camera} --model {self.matrix.model} --accuracy "
             f"{self.matrix.accuracy:g} --superpixels {rows}x{columns} -o pif.h5",
-            f"plenocli reconstruct {capture} --pif pif.h5 --method {self.inversion.method} "
-            + ("" if steps is None else f"--nnls-iterations {steps} ")
-            + "-o image.h5",
+            f"plenocli reconstruct {capture} --pif pif.h5 --method {self.method} -o image.h5",
         ]
 
 
@@ -155,7 +133,7 @@ def _replaced(option: MatrixOption, noise: float) -> bool:
 
 
 def chains_of(
-    camera: Camera, matrices: Sequence[MatrixOption], inversions: Sequence[Inversion] = INVERSIONS
+    camera: Camera, matrices: Sequence[MatrixOption], methods: Sequence[str] = INVERSIONS
 ) -> list[Chain]:
     """Every matrix with every method, the cheapest first.
 
@@ -164,18 +142,18 @@ def chains_of(
     lenslets = int(np.prod(camera.lenslet_array.count))
     found = []
     for matrix in matrices:
-        for inversion in inversions:
-            if inversion.method == "block-mean" and not matrix.own_only and len(matrices) > 1:
+        for method in methods:
+            if method == "block-mean" and not matrix.own_only and len(matrices) > 1:
                 continue
             effort = Effort.of(matrix.plan, lenslets)
             making, solving = (
                 matrix_cost(matrix.plan),
-                inversion_cost(inversion.method, inversion.iterations, effort),
+                inversion_cost(method, effort),
             )
             found.append(
                 Chain(
                     matrix=matrix,
-                    inversion=inversion,
+                    method=method,
                     seconds=making.seconds + solving.seconds,
                     bytes=max(making.bytes, solving.bytes),
                 )

@@ -9,12 +9,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from plenocli.inverse.chain.chains import Chain, Inversion, MatrixOption
+from plenocli.inverse.chain.chains import Chain, MatrixOption
 from plenocli.inverse.chain.rehearsal import Rehearsal
 from plenocli.inverse.picture.methods.method import Sees
 from plenocli.inverse.picture.methods.registry import METHODS
 
-PROBE = Inversion("lmmse")
+PROBE = "lmmse"
 """The method by which matrices are compared, and the neighbourhoods."""
 MARGIN, PART = 0.04, 0.25
 """dB, and share of what is allowed, by which a chain must do better, since rehearsals miss."""
@@ -67,20 +67,20 @@ def choose(chains: Sequence[Chain], rehearsal: Rehearsal, allowed: float) -> Cha
     """
     matrices = list(dict.fromkeys(chain.matrix for chain in chains))
     finest = min(matrices, key=_fineness)
-    methods = list(dict.fromkeys(chain.inversion for chain in chains))
+    methods = list(dict.fromkeys(chain.method for chain in chains))
     by_method = {m: rehearsal.psnr(finest, m) for m in methods}
     by_matrix = _by_matrix(matrices, finest, rehearsal, allowed)
 
     def expected(chain: Chain) -> np.ndarray:
-        if METHODS[chain.inversion.method].sees is Sees.LENSLET_AS_IS:
-            return by_method[chain.inversion]  # the mean of a lenslet hardly needs the matrix
-        return by_method[chain.inversion] + by_matrix[chain.matrix] - by_method[PROBE]
+        if METHODS[chain.method].sees is Sees.LENSLET_AS_IS:
+            return by_method[chain.method]  # the mean of a lenslet hardly needs the matrix
+        return by_method[chain.method] + by_matrix[chain.matrix] - by_method[PROBE]
 
     # what is expected to be the best is rehearsed, until nothing else is expected to be better
     known = {
         chain: found
         for chain in chains
-        if (found := rehearsal.known(chain.matrix, chain.inversion)) is not None
+        if (found := rehearsal.known(chain.matrix, chain.method)) is not None
     }
 
     def lost(psnr: np.ndarray) -> float:
@@ -93,7 +93,7 @@ def choose(chains: Sequence[Chain], rehearsal: Rehearsal, allowed: float) -> Cha
     for chain in sorted((c for c in chains if c not in known), key=mean, reverse=True):
         if mean(chain) <= max(float(np.mean(found)) for found in known.values()):
             break
-        known[chain] = rehearsal.psnr(chain.matrix, chain.inversion)
+        known[chain] = rehearsal.psnr(chain.matrix, chain.method)
     best = min(known, key=lambda chain: lost(known[chain]))
     limit = (1 - PART) * allowed - MARGIN
     chosen = best
@@ -103,7 +103,7 @@ def choose(chains: Sequence[Chain], rehearsal: Rehearsal, allowed: float) -> Cha
         if chain not in known and lost(expected(chain)) > limit + SLACK:
             continue
         if chain not in known:
-            known[chain] = rehearsal.psnr(chain.matrix, chain.inversion)
+            known[chain] = rehearsal.psnr(chain.matrix, chain.method)
         if lost(known[chain]) <= limit:
             chosen = chain
             break

@@ -55,7 +55,7 @@ class Effort:
         )
         return cls(sizes=sizes, coupled=superpixels > 1)
 
-    def features(self, iterations: int | None) -> dict[str, float]:
+    def features(self) -> dict[str, float]:
         """Number of each thing that takes time."""
         n = self.sizes
         joint = float(self.coupled)
@@ -64,7 +64,7 @@ class Effort:
             "decomposition": float(n.pixels * n.points * n.least),
             "covariance": float(n.points) ** 3,
             "lenslet values": float(n.lenslets * n.points),
-            "lenslet products": float(n.lenslets * n.pixels * n.points) * (iterations or 1),
+            "lenslet products": float(n.lenslets * n.pixels * n.points),
             "joint start": joint,
             "joint directions": joint * n.directions * n.points * n.offsets,
             "joint products": joint * n.directions**2 * n.points,
@@ -78,12 +78,9 @@ def laws(path: Path = FITTED) -> dict[str, Law]:
     return read(path)
 
 
-def inversion_cost(method: str, iterations: int | None, effort: Effort) -> Spent:
-    """What reconstruct costs with a matrix that is there.
-
-    iterations: steps, where the method takes a number of them.
-    """
-    seconds = priced(laws()[method].seconds, effort.features(iterations))
+def inversion_cost(method: str, effort: Effort) -> Spent:
+    """What reconstruct costs with a matrix that is there."""
+    seconds = priced(laws()[method].seconds, effort.features())
     one = METHODS[method]
     looks = one.sees is not Sees.LENSLET_AS_IS
     phases = cleaned(one.phases) if looks else one.phases

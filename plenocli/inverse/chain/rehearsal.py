@@ -20,14 +20,13 @@ from plenocli.base.tiling import to_blocks
 from plenocli.forward.accuracy.dial import plan_pif
 from plenocli.forward.accuracy.limiting_error import what_limits
 from plenocli.forward.camera.model import Camera
-from plenocli.forward.propagation.accuracy_record import AccuracyRecord
 from plenocli.forward.propagation.plan import PifPlan
 from plenocli.forward.propagation.system_matrix import build_pif
 from plenocli.forward.scene.light import Quadrature
 from plenocli.forward.scene.sample import ALL
 from plenocli.forward.scene.scenes import Scene
 from plenocli.forward.sensor.exposure import ExposureOptions, SimulatedCapture, simulate_capture
-from plenocli.inverse.chain.chains import Inversion, MatrixOption
+from plenocli.inverse.chain.chains import MatrixOption
 from plenocli.inverse.picture.estimate import estimate
 from plenocli.inverse.picture.estimators import Estimators, Options
 from plenocli.inverse.picture.lenslet_model import LensletMatrix, Superpixels, gathered
@@ -129,30 +128,27 @@ class Rehearsal:
             self._reference = self._isolated("fresnel", max(finest.accuracy / FINER, FINEST))
         self._wrong: dict[tuple[str, float], np.ndarray] = {}
         self._ready: dict[MatrixOption, Estimators] = {}
-        self._found: dict[tuple[MatrixOption, Inversion], np.ndarray] = {}
+        self._found: dict[tuple[MatrixOption, str], np.ndarray] = {}
         self._first = Estimators(self.pilot, Options(seed=seed), read_pictures)
 
-    def psnr(self, matrix: MatrixOption, inversion: Inversion) -> np.ndarray:
+    def psnr(self, matrix: MatrixOption, method: str) -> np.ndarray:
         """PSNR (dB, peak 1; of every draw) of the picture that a chain gives of the part."""
-        key = matrix, inversion
+        key = matrix, method
         if key not in self._found:
-            self._found[key] = np.array([self._tried(matrix, inversion, d) for d in self.data])
+            self._found[key] = np.array([self._tried(matrix, method, d) for d in self.data])
         return self._found[key]
 
-    def known(self, matrix: MatrixOption, inversion: Inversion) -> np.ndarray | None:
+    def known(self, matrix: MatrixOption, method: str) -> np.ndarray | None:
         """The same of a chain that was rehearsed; None of another."""
-        return self._found.get((matrix, inversion))
+        return self._found.get((matrix, method))
 
-    def _tried(self, matrix: MatrixOption, inversion: Inversion, data: Superpixels) -> float:
+    def _tried(self, matrix: MatrixOption, method: str, data: Superpixels) -> float:
         estimators = self._estimators(matrix)
-        options = Options(
-            method=inversion.method, nnls_iterations=inversion.iterations, seed=self.seed
-        )
         limits = what_limits(self.noise, estimators.system.accuracy)
         off = 0.0 if limits is None or limits.limited_by == "noise" else limits.model_error
-        made = estimators.with_options(options)
+        made = estimators.with_options(Options(method=method, seed=self.seed))
         with collected_notes():
-            found, _ = estimate(made, METHODS[inversion.method], data, model_error=off)
+            found, _ = estimate(made, METHODS[method], data, model_error=off)
         self.runs += 1
         error = float(np.mean(np.square(found.value.reshape(self.truth.shape) - self.truth)))
         return -10 * float(np.log10(max(error, 1e-12)))
@@ -176,10 +172,11 @@ class Rehearsal:
         own = self.pilot.own + self._wrong[key]
         record = matrix.plan.accuracy_record()
         if matrix.own_only:
-            return _with(self.pilot, own[None], np.zeros((1, 2), int), record)
+            alone = np.zeros((1, 2), int)
+            return replace(self.pilot, blocks=own[None], offsets=alone, accuracy=record)
         blocks = self.pilot.blocks.copy()
         blocks[np.flatnonzero(np.all(self.pilot.offsets == 0, axis=1))[0]] = own
-        return _with(self.pilot, blocks, self.pilot.offsets, record)
+        return replace(self.pilot, blocks=blocks, accuracy=record)
 
     def _isolated(self, model: str, accuracy: float) -> np.ndarray | None:
         """(pixel, point) own superpixel of a lenslet without neighbours; None where the model does
@@ -222,9 +219,3 @@ def _matrix(camera: Camera, plan: PifPlan) -> LensletMatrix:
         object_shape=matrix.object_shape,
         accuracy=plan.accuracy_record(),
     )
-
-
-def _with(
-    pilot: LensletMatrix, blocks: np.ndarray, offsets: np.ndarray, record: AccuracyRecord
-) -> LensletMatrix:
-    return replace(pilot, blocks=blocks, offsets=offsets, accuracy=record)

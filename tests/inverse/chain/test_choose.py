@@ -26,13 +26,13 @@ class Table:
     def runs(self):
         return len(self.asked)
 
-    def psnr(self, matrix, inversion):
-        key = matrix, inversion
+    def psnr(self, matrix, method):
+        key = matrix, method
         self.asked[key] = np.array([self.table[key], self.table[key]])
         return self.asked[key]
 
-    def known(self, matrix, inversion):
-        return self.asked.get((matrix, inversion))
+    def known(self, matrix, method):
+        return self.asked.get((matrix, method))
 
 
 def drawn(rng, spread):
@@ -45,12 +45,12 @@ def drawn(rng, spread):
     by_method = {i: rng.exponential(0.5) for i in INVERSIONS}
     table = {
         (m, i): 30
-        - (by_method[i] if i.method == "block-mean" else by_matrix[m] + by_method[i])
+        - (by_method[i] if i == "block-mean" else by_matrix[m] + by_method[i])
         + rng.uniform(-spread, spread)
         for m in matrices
         for i in INVERSIONS
     }
-    chains = [Chain(matrix=m, inversion=i, seconds=rng.exponential(1.0), bytes=0) for m, i in table]
+    chains = [Chain(matrix=m, method=i, seconds=rng.exponential(1.0), bytes=0) for m, i in table]
     return sorted(chains, key=lambda c: c.seconds), table
 
 
@@ -64,8 +64,8 @@ def test_the_choice_is_the_cheapest_that_brute_force_finds(allowed):
         chains, table = drawn(rng, 0.02)
         rehearsal = Table(table)
         plan = choose(chains, rehearsal, allowed)
-        top = max(table[c.matrix, c.inversion] for c in chains)
-        lost = {c: top - table[c.matrix, c.inversion] for c in chains}
+        top = max(table[c.matrix, c.method] for c in chains)
+        lost = {c: top - table[c.matrix, c.method] for c in chains}
         limit = (1 - PART) * allowed - MARGIN
         assert lost[plan.best.chain] <= 0.1, "the best but for what does not add up"
         if plan.chosen is not plan.best:
@@ -136,7 +136,7 @@ def test_losses_are_those_of_the_stages_and_the_commands_run(tmp_path, monkeypat
     alone = next(
         c
         for c in told["chains"]
-        if c["superpixels"] == [1, 1] and c["method"] == PROBE.method and c["rehearsed"]
+        if c["superpixels"] == [1, 1] and c["method"] == PROBE and c["rehearsed"]
     )
     top = db(best, "best")
     assert top - db(chosen, "chosen") == pytest.approx(chosen["loss_db"], abs=0.25)

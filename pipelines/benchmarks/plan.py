@@ -54,7 +54,7 @@ SCENES = {
 }
 SIZED = (("demo_spatial.toml", (12, 12)),)
 """Cameras, with lenslets, by which --fit sees how costs grow."""
-FIRST = {"fit": 0, "judge": 200}
+FIRST = {"fit": 0, "judge": 300}
 """Number of the first case: those of the judgement below were looked at while `plan` was made."""
 ALLOWED = (0.1, 0.3, 1.0)
 """dB of --quality-loss that are judged."""

@@ -1,9 +1,9 @@
 """What chains lose, rehearsed: a small part of the scene is captured by a cheap pilot matrix and
 inverted with matrices that are as wrong as each chain's would be.
 
-The pilot is the finest matrix, or the paraxial model where that takes long. How a candidate is
-wrong is computed where that is cheap, on isolated lenslets: its own superpixel less that of the
-finest model, with its true structure. docs/model.md, "The cheapest chain".
+The pilot is the finest matrix and candidates are themselves; where that takes long it is the
+paraxial model, and how a candidate is wrong is computed on isolated lenslets: its own superpixel
+less that of the finest model, with its true structure. docs/model.md, "The cheapest chain".
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ FINER = 3.0
 FINEST = 1e-6
 LONG = 5.0
 """Seconds of the matrix of the capture from which on the pilot is paraxial."""
-DRAWS = 3
+DRAWS = 2
 """Captures, which differ in their noise: what reconstruct finds may hang on it."""
 
 
@@ -115,6 +115,7 @@ class Rehearsal:
         if made is None:
             plan = _paraxial(camera, finest.superpixels, finest.accuracy)
             made = captured(plan)
+        self.exact = plan is finest.plan
         self.pilot = _matrix(camera, plan)
         shots = [made, *(captured(plan, draw) for draw in range(1, DRAWS))]
         self.data = [superpixels(shot.capture, self.pilot) for shot in shots]
@@ -123,9 +124,12 @@ class Rehearsal:
         self.truth = to_blocks(np.asarray(seen[0], float), self.pilot.object_shape)
         data = self.data[0]
         self.noise = data.known_sigma / float(np.sqrt(np.mean(np.square(data.y))))
-        self._reference = self._isolated("exact", max(finest.accuracy / FINER, FINEST))
-        if self._reference is None:
-            self._reference = self._isolated("fresnel", max(finest.accuracy / FINER, FINEST))
+        finer = max(finest.accuracy / FINER, FINEST)
+        self._reference = None
+        if not self.exact:
+            self._reference = self._isolated("exact", finer)
+            if self._reference is None:
+                self._reference = self._isolated("fresnel", finer)
         self._wrong: dict[tuple[str, float], np.ndarray] = {}
         self._ready: dict[MatrixOption, Estimators] = {}
         self._found: dict[tuple[MatrixOption, str], np.ndarray] = {}
@@ -159,7 +163,11 @@ class Rehearsal:
         return self._ready[matrix]
 
     def _as_wrong_as(self, matrix: MatrixOption) -> LensletMatrix:
-        """The pilot with the error that a matrix would have."""
+        """The matrix itself, which costs no more than the finest, where that is the pilot; else the
+        pilot with the error that it would have.
+        """
+        if self.exact:
+            return _matrix(self.camera, matrix.plan)
         key = matrix.model, matrix.accuracy
         if key not in self._wrong:
             found = self._isolated(*key)

@@ -1,6 +1,10 @@
 """Captures larger than a tile: the same pictures as in one piece, whatever works on them."""
 
 import json
+import os
+import subprocess
+import sys
+import time
 
 import numpy as np
 import pytest
@@ -121,6 +125,58 @@ def test_a_run_that_ended_goes_on_from_its_tiles(folder, tmp_path, small_tiles, 
     assert run(command) == 0
     assert solved == [0, 1, 2, 1, 3]
     assert sorted(p.name for p in tmp_path.iterdir()) == ["out.h5", "right.h5"]
+    one, two = (read_artefact(tmp_path / name, "image") for name in ("right.h5", "out.h5"))
+    for name, values in one.data.items():
+        np.testing.assert_array_equal(two.data[name], values)
+
+
+ELSEWHERE = """
+import sys
+from plenocli.cli.main import run
+from plenocli.inverse.picture import tiles
+if __name__ == "__main__":
+    tiles.AT_ONCE = int(sys.argv[1])
+    sys.exit(run(sys.argv[2:]))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("workers", ["1", "2"])
+def test_kill_9_loses_no_more_than_the_tiles_under_way(folder, tmp_path, monkeypatch, workers):
+    made, at_once = folder[0] / "alone", (SIDE // 2) ** 2 * (81 + 36 + tiles.FURTHER)
+    monkeypatch.setattr(tiles, "AT_ONCE", at_once)
+    picture(made, tmp_path / "right.h5", method="lmmse")
+    (tmp_path / "elsewhere.py").write_text(ELSEWHERE)
+    command = ["reconstruct", str(made / "capture.h5"), "--pif", str(made / "pif.h5")]
+    command += ["--method", "lmmse", "-o", str(tmp_path / "out.h5")]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    program = [sys.executable, str(tmp_path / "elsewhere.py"), str(at_once), *command]
+
+    def finished():
+        return {p.name: p.read_bytes() for p in tmp_path.glob(".out.h5.*.tiles/0*[0-9]")}
+
+    kept = {}
+    for _ in range(2):
+        process = subprocess.Popen([*program, "--workers", workers], env=environment)
+        while len(finished()) < len(kept) + 2 and process.poll() is None:
+            time.sleep(0.002)
+        process.kill()
+        assert process.wait() == -9
+        known = finished()
+        # what was whole before the kill is what it was, and tiles are there whole or not at all
+        assert kept.items() <= known.items() and len(known) > len(kept)
+        kept = known
+    solved, solve = [], reconstruct._TileTask.__call__
+
+    def counted(self, job):
+        solved.append(job[0])
+        return solve(self, job)
+
+    monkeypatch.setattr(reconstruct._TileTask, "__call__", counted)
+    assert run(command) == 0
+    assert len(solved) == 16 - len(kept) and not {f"{n:06d}" for n in solved} & kept.keys()
+    left = sorted(p.name for p in tmp_path.iterdir())
+    assert left == ["elsewhere.py", "out.h5", "right.h5"]
     one, two = (read_artefact(tmp_path / name, "image") for name in ("right.h5", "out.h5"))
     for name, values in one.data.items():
         np.testing.assert_array_equal(two.data[name], values)

@@ -146,10 +146,12 @@ class Whole:
 
     found: name -> which of that name -> value.
     closed: whether nothing is added: a tile works out by itself what was not found.
+    only_means: whether the piece is looked at for these alone, and its picture not wanted.
     """
 
     found: dict[Shared, dict[Any, Any]]
     closed: bool = False
+    only_means: bool = False
 
     def value(self, name: Shared, work: Callable[[], Any], which: Any) -> Any:
         """As Superpixels.common; the last of a name where this one was not found."""
@@ -161,9 +163,10 @@ class Whole:
             self.found.setdefault(name, {})[which] = made
         return made
 
-    def without_means(self) -> Whole:
+    def for_means(self) -> Whole:
         """For another piece, which finds its own."""
-        return Whole({name: dict(of) for name, of in self.found.items() if name not in MEANS})
+        known = {name: dict(of) for name, of in self.found.items() if name not in MEANS}
+        return Whole(known, only_means=True)
 
     def closed_with(self, others: Sequence[Whole]) -> Whole:
         """With the means over other pieces in place of what the one piece found."""

@@ -567,7 +567,8 @@ def _in_tiles(
         recipe=recipe, capture=capture, finer=finer, model_error=_off(limits), whole=whole
     )
     others = tiles if method.weighs_all else spread_over(source.count, side_of(system))
-    sample, seen, task = task.sample(estimators, source, middle, others)
+    sample, seen = task.sample(estimators, data)
+    task = task.sharing(pool, others)
     depends = replace(settings, workers=1), recipe.digests, file_digest(capture), tiles
     bench = Bench.beside(target, depends)
     clip = partial(np.maximum, 0) if settings.clip else np.asarray
@@ -607,37 +608,51 @@ class _TileTask:
     whole: Whole
 
     def sample(
-        self, estimators: Estimators, source: Source, like: Tile, others: Sequence[Tile]
-    ) -> tuple[Reconstruction, Seen | None, _TileTask]:
-        """(the picture of `like`, the piece that stands for the whole, what is seen in it, the task
-        that knows the whole): `others` stand beside it.
-        """
-        method = METHODS[self.recipe.settings.method]
+        self, estimators: Estimators, data: Superpixels
+    ) -> tuple[Reconstruction, Seen | None]:
+        """(the picture of `data`, the piece that stands for the whole, what is seen in it)."""
+        method, data = METHODS[self.recipe.settings.method], replace(data, whole=self.whole)
         cause = partial(likely_cause, estimators)
-        off, whole = self.model_error, self.whole
-        data = replace(source.cut(*like.around), whole=whole)
-        found, seen = estimate(estimators, method, data, model_error=off, explain=cause)
-        beside = [whole.without_means() for _ in others]
-        for piece, own in bar(list(zip(others, beside)), len(others), "what tiles share"):
-            with collected_notes():
-                data = replace(source.cut(*piece.around), whole=own)
-                estimate(estimators, method, data, model_error=off)
-        return found, seen, replace(self, whole=whole.closed_with(beside))
+        return estimate(estimators, method, data, model_error=self.model_error, explain=cause)
+
+    def sharing(self, pool: Pool, pieces: Sequence[Tile]) -> _TileTask:
+        """The task that knows the whole, what `pieces` share beside the sample in it."""
+        found = {}
+        with bar(None, len(pieces), "what tiles share") as progress:
+            jobs = ((n, self.shared, piece) for n, piece in enumerate(pieces))
+            for number, own in run_all(pool, jobs):
+                if isinstance(own, PlenoError):
+                    raise own
+                found[number] = own
+                progress.update()
+        return replace(self, whole=self.whole.closed_with([own for _, own in sorted(found.items())]))
+
+    def shared(self, piece: Tile) -> Whole:
+        """What a piece adds to the means over pieces."""
+        own = self.whole.for_means()
+        self._estimated(piece, own)
+        return own
 
     def __call__(self, job: tuple[int, Tile]) -> SolvedTile:
-        """A tile; what there is to say was said of the whole."""
-        tile, recipe = job[1], self.recipe
-        estimators = (_finer(recipe) if self.finer else None) or _estimators(recipe)
-        method = METHODS[recipe.settings.method]
-        with collected_notes():
-            with superpixel_source(
-                self.capture, estimators.system, recipe.calibration, verify=False
-            ) as source:
-                data = replace(source.cut(*tile.around, tile.within), whole=self.whole)
-            found, _ = estimate(estimators, method, data, model_error=self.model_error)
+        """A tile."""
+        tile = job[1]
+        found = self._estimated(tile, self.whole)
         sigma = None if found.sigma is None else found.sigma[tile.within]
         value, trace = found.value[tile.within], found.trace
         return SolvedTile(value=value, sigma=sigma, trace=trace, stats=found.stats)
+
+    def _estimated(self, tile: Tile, whole: Whole) -> Reconstruction:
+        """A piece; what there is to say was said of the whole."""
+        recipe = self.recipe
+        estimators = (_finer(recipe) if self.finer else None) or _estimators(recipe)
+        opened = superpixel_source(
+            self.capture, estimators.system, recipe.calibration, verify=False
+        )
+        with collected_notes():
+            with opened as source:
+                data = replace(source.cut(*tile.around, tile.within), whole=whole)
+            method = METHODS[recipe.settings.method]
+            return estimate(estimators, method, data, model_error=self.model_error)[0]
 
 
 def _estimate(

@@ -51,6 +51,13 @@ class OwnLight:
     joint: JointEstimate | None = None
     inner: tuple[slice, slice] | EllipsisType = ...
 
+    @property
+    def counted(self) -> np.ndarray:
+        """(lenslet,) which of these are not there for their neighbours' sake."""
+        own = np.zeros(self.y.shape[:2], bool)
+        own[self.data.own] = True
+        return own[self.inner].ravel()
+
 
 @dataclass(frozen=True, kw_only=True)
 class Estimate:

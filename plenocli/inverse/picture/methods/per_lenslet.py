@@ -36,7 +36,7 @@ TOO_LOUD = 50
 """Times the noise that a dictionary was learnt for, from which on it falls behind lmmse."""
 
 Solve = Callable[
-    [Estimators, np.ndarray, Superpixels, np.ndarray | None], tuple[np.ndarray, Stats | None]
+    [Estimators, np.ndarray, OwnLight, np.ndarray | None], tuple[np.ndarray, Stats | None]
 ]
 """(estimators, y (pixel, signal), the capture they are of, truth (point, signal) or None) ->
 (x (point, signal), what there is to tell).
@@ -109,7 +109,7 @@ class DictionaryStats:
 
 
 def block_mean(
-    estimators: Estimators, y: np.ndarray, data: Superpixels, truth: np.ndarray | None
+    estimators: Estimators, y: np.ndarray, light: OwnLight, truth: np.ndarray | None
 ) -> tuple[np.ndarray, None]:
     """One value a lenslet and band."""
     system = estimators.system
@@ -117,7 +117,7 @@ def block_mean(
 
 
 def tikhonov(
-    estimators: Estimators, y: np.ndarray, data: Superpixels, truth: np.ndarray | None
+    estimators: Estimators, y: np.ndarray, light: OwnLight, truth: np.ndarray | None
 ) -> tuple[np.ndarray, TikhonovStats]:
     """Weight given, by the discrepancy principle, or with hindsight."""
     svd, alpha, rule = estimators.svd, estimators.options.alpha, "given"
@@ -125,14 +125,14 @@ def tikhonov(
     if alpha is None and truth is not None:
         alpha, rule = least_squares.oracle_alpha(svd, z, truth), HINDSIGHT
     elif alpha is None:
-        power = data.common("power", lambda: least_squares.power_of(z))
-        alpha = least_squares.discrepancy_alpha(svd, power, data.known_sigma)
+        power = light.data.common("power", lambda: least_squares.power_of(z[:, light.counted]))
+        alpha = least_squares.discrepancy_alpha(svd, power, light.data.known_sigma)
         rule = "discrepancy"
     return least_squares.tikhonov(svd, z, alpha), TikhonovStats(alpha=float(alpha), rule=rule)
 
 
 def tsvd(
-    estimators: Estimators, y: np.ndarray, data: Superpixels, truth: np.ndarray | None
+    estimators: Estimators, y: np.ndarray, light: OwnLight, truth: np.ndarray | None
 ) -> tuple[np.ndarray, TsvdStats]:
     """Rank given, by the least estimated error, or with hindsight."""
     svd, rank, rule = estimators.svd, estimators.options.rank, "given"
@@ -140,15 +140,15 @@ def tsvd(
     if rank is None and truth is not None:
         rank, rule = least_squares.oracle_rank(svd, z, truth), HINDSIGHT
     elif rank is None:
-        power = data.common("power", lambda: least_squares.power_of(z))
-        rank = least_squares.best_rank(svd, power, data.known_sigma)
+        power = light.data.common("power", lambda: least_squares.power_of(z[:, light.counted]))
+        rank = least_squares.best_rank(svd, power, light.data.known_sigma)
         rule = "least estimated error"
     rank = min(rank, svd.rank())
     return least_squares.truncated(svd, z, rank), TsvdStats(rank=int(rank), rule=rule)
 
 
 def nnls(
-    estimators: Estimators, y: np.ndarray, data: Superpixels, truth: np.ndarray | None
+    estimators: Estimators, y: np.ndarray, light: OwnLight, truth: np.ndarray | None
 ) -> tuple[np.ndarray, NnlsStats]:
     """Converged, or stopped after so many iterations as the options say."""
     svd, steps = estimators.svd, estimators.options.nnls_iterations
@@ -186,11 +186,11 @@ def nnls_batch(estimators: Estimators, z: np.ndarray) -> tuple[np.ndarray, float
 
 
 def dictionary(
-    estimators: Estimators, y: np.ndarray, data: Superpixels, truth: np.ndarray | None
+    estimators: Estimators, y: np.ndarray, light: OwnLight, truth: np.ndarray | None
 ) -> tuple[np.ndarray, DictionaryStats]:
     """The mean over the mirror images of a learnt dictionary."""
     learnt, svd, asked = estimators.learnt, estimators.svd, estimators.options.lam
-    sigma, scale = data.known_sigma, float(svd.s[0])
+    sigma, scale = light.data.known_sigma, float(svd.s[0])
     louder = max(1.0, sigma / scale / learnt.sigma) if learnt.sigma > 0 else 1.0
     lam = asked if asked is not None else learnt.lam * louder**LOUDER_POWER
     if louder > TOO_LOUD:
@@ -269,7 +269,7 @@ def _by_lenslet(solve: Solve, bars: bool, estimators: Estimators, light: OwnLigh
     rows, columns = y.shape[:2]
     if truth is not None:
         truth = truth[light.inner].reshape(-1, truth.shape[2]).T
-    found, stats = solve(estimators, y.reshape(rows * columns, -1).T, light.data, truth)
+    found, stats = solve(estimators, y.reshape(rows * columns, -1).T, light, truth)
     value = found.T.reshape(rows, columns, -1)
     left = error_bars.of_picture(estimators, light.data, y, value) if bars else None
     if light.joint is not None:

@@ -102,20 +102,33 @@ def _from_lmmse(
     else:
         x[inner], sigma[inner] = adaptive_lmmse(estimators, light.data, y[inner])
     error = float(np.sqrt(light.data.common("start", lambda: np.mean(sigma[inner] ** 2))))
-    held = None
-    if joint is not None:
-        edge = np.ones(y.shape[:2], bool)
-        edge[inner] = False
-        held = edge, x.copy()
-    term = whole_sensor.DataTerm(estimators.svd, shape, y, noise, 2 * error, held)
-    picture, rule, rounds = solve(estimators, term, to_plane(x, shape), error)
-    found = to_blocks(picture, shape)
+    found, rule, rounds = x.copy(), "", 0
+    if not (light.data.whole and light.data.whole.only_means):
+        near, held = _near(light.data.own, y.shape, -(-LOOK // min(shape))), None
+        if joint is not None:
+            edge = np.ones(y.shape[:2], bool)
+            edge[inner] = False
+            held = edge[near], x[near]
+        term = whole_sensor.DataTerm(estimators.svd, shape, y[near], noise, 2 * error, held)
+        picture, rule, rounds = solve(estimators, term, to_plane(x[near], shape), error)
+        found[near] = to_blocks(picture, shape)
     sigma[inner] = error_bars.of_picture(estimators, light.data, y[inner], found[inner], factor)
     return Estimate(
         value=found,
         sigma=sigma,
         from_lmmse=root_mean_square(found - x),
         stats=WholePictureStats(expected_error=error, rounds=rounds, rule=rule, wide=wide),
+    )
+
+
+def _near(
+    own: tuple[slice, slice], count: tuple[int, ...], reach: int
+) -> tuple[slice, slice]:
+    """Lenslets of a tile that its own and those up to `reach` beside them are, of `count`."""
+    rows, columns = (part.indices(n)[:2] for part, n in zip(own, count))
+    return (
+        slice(max(0, rows[0] - reach), rows[1] + reach),
+        slice(max(0, columns[0] - reach), columns[1] + reach),
     )
 
 

@@ -625,7 +625,9 @@ class _TileTask:
                     raise own
                 found[number] = own
                 progress.update()
-        return replace(self, whole=self.whole.closed_with([own for _, own in sorted(found.items())]))
+        return replace(
+            self, whole=self.whole.closed_with([own for _, own in sorted(found.items())])
+        )
 
     def shared(self, piece: Tile) -> Whole:
         """What a piece adds to the means over pieces."""

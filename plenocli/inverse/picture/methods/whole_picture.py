@@ -121,9 +121,7 @@ def _from_lmmse(
     )
 
 
-def _near(
-    own: tuple[slice, slice], count: tuple[int, ...], reach: int
-) -> tuple[slice, slice]:
+def _near(own: tuple[slice, slice], count: tuple[int, ...], reach: int) -> tuple[slice, slice]:
     """Lenslets of a tile that its own and those up to `reach` beside them are, of `count`."""
     rows, columns = (part.indices(n)[:2] for part, n in zip(own, count))
     return (

@@ -3,8 +3,8 @@
 Similar patches of a picture are stacked and transformed together (a cosine transform in each patch,
 Walsh-Hadamard across the stack), shrunk there and put back, overlaps averaged with weights: K.
 Dabov, A. Foi, V. Katkovnik, K. Egiazarian, IEEE Trans. Image Processing 16 (2007) 2080. Written
-from the paper, in matrix products on strips of the picture, so that memory does not
-grow with its height.
+from the paper, in matrix products on strips of the picture, so that memory grows with its height
+by what is alike alone.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ TOGETHER = 4096
 """Stacks that are filtered together."""
 
 
-def block_matching(
-    picture: np.ndarray, sigma: float, pilot: np.ndarray | None = None
-) -> np.ndarray:
+Matched = dict[int, np.ndarray]
+"""First row of a strip of patches -> which are like them, see `_match`."""
+
+
+def block_matching(picture: np.ndarray, sigma: float, matched: Matched | None = None) -> np.ndarray:
     """A picture with its white noise removed.
 
     picture: (row, column).
     sigma: standard deviation of the noise.
-    pilot: a picture like it with less noise, or None. Without one coefficients are cut at THRESHOLD
-        sigma; with one patches are matched in it and shrunk by the Wiener factor p^2 / (p^2 +
-        sigma^2) of its coefficients p.
+    matched: what was found alike in a picture of this shape, for the next; filled where empty.
 
     Returns (row, column) float64.
     Dabov et al. 2007.
@@ -42,26 +42,22 @@ def block_matching(
     unit = np.abs(picture).max()  # squares of very large or small values leave single precision
     if unit == 0:
         return picture.copy()
-    picture, sigma, pilot = (
-        picture / unit,
-        sigma / unit,
-        None if pilot is None else np.asarray(pilot, float) / unit,
-    )
+    picture, sigma = picture / unit, sigma / unit
     patch = min(PATCH, *picture.shape)
     rows, columns = (_corners(n, patch) for n in picture.shape)
     least = min(SEARCH + 1, picture.shape[0] - patch + 1) * min(
         SEARCH + 1, picture.shape[1] - patch + 1
     )
     stack = min(STACK, 1 << (least.bit_length() - 1))
-    guide = np.asarray(picture if pilot is None else pilot, np.float32)
     source = np.asarray(picture, np.float32)
     total, weight = np.zeros(picture.shape), np.zeros(picture.shape)
+    matched = {} if matched is None else matched
     for strip in np.array_split(rows, max(1, -(-len(rows) * len(columns) // TOGETHER))):
         span = slice(max(strip[0] - SEARCH, 0), min(strip[-1] + patch + SEARCH, picture.shape[0]))
-        stacks = _match(guide[span], strip - span.start, columns, patch, stack)
-        one, two = _filter(
-            source[span], None if pilot is None else guide[span], stacks, patch, sigma
-        )
+        if strip[0] not in matched:
+            found = _match(source[span], strip - span.start, columns, patch, stack)
+            matched[strip[0]] = found.astype(np.int32)
+        one, two = _filter(source[span], matched[strip[0]], patch, sigma)
         total[span] += one
         weight[span] += two
     return unit * total / weight
@@ -75,12 +71,12 @@ def _corners(length: int, patch: int) -> np.ndarray:
 
 
 def _match(
-    guide: np.ndarray, rows: np.ndarray, columns: np.ndarray, patch: int, stack: int
+    source: np.ndarray, rows: np.ndarray, columns: np.ndarray, patch: int, stack: int
 ) -> np.ndarray:
     """Flat corners (reference, stack) of the patches most like those with corners at rows x
     columns, these first.
     """
-    height, width = guide.shape
+    height, width = source.shape
     sum_rows = np.zeros((len(rows), height), np.float32)
     for k, first in enumerate(rows):
         sum_rows[k, first : first + patch] = 1
@@ -104,7 +100,7 @@ def _match(
             np.searchsorted(columns, width - patch - right, side="right"),
         )
         change = (
-            guide[r, c] - guide[r.start + down : r.stop + down, c.start + right : c.stop + right]
+            source[r, c] - source[r.start + down : r.stop + down, c.start + right : c.stop + right]
         )
         down_patches = sum_rows[at_r, r] @ np.square(change, out=change)
         sums = up_to[: len(down_patches), : down_patches.shape[1] + 1]
@@ -120,13 +116,12 @@ def _match(
 
 
 def _filter(
-    source: np.ndarray, guide: np.ndarray | None, stacks: np.ndarray, patch: int, sigma: float
+    source: np.ndarray, stacks: np.ndarray, patch: int, sigma: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """(weighted sum, weights), each like source, of the filtered patches.
 
     Every patch of the plane is transformed once, and what stacks make of it is summed before it is
     transformed back.
-    guide: None, or the pilot.
     """
     from scipy.sparse import csr_array
 
@@ -136,23 +131,13 @@ def _filter(
     rows, columns = np.divmod(stacks.T.ravel(), shape[1])
     at = rows * corners[1] + columns
 
-    def forward(plane: np.ndarray) -> np.ndarray:
-        """(place in its stack, stack times coefficient)."""
-        patches = sliding_window_view(plane, (patch, patch)).reshape(-1, patch * patch)
-        return across @ (patches @ cosine.T)[at].reshape(stacks.shape[1], -1)
-
-    spectrum = forward(source).reshape(stacks.shape[1], len(stacks), -1)
-    if guide is None:
-        keep = np.abs(spectrum) > THRESHOLD * sigma
-        keep[0, :, 0] = True
-        spectrum *= keep
-        weight = 1 / keep.sum(axis=(0, 2), dtype=np.float32)
-    else:
-        wiener = np.square(forward(guide)).reshape(spectrum.shape)
-        wiener /= wiener + np.float32(max(sigma, 1e-12) ** 2)
-        wiener[0, :, 0] = 1
-        spectrum *= wiener
-        weight = 1 / np.maximum(np.square(wiener).sum(axis=(0, 2)), 1)
+    patches = sliding_window_view(source, (patch, patch)).reshape(-1, patch * patch)
+    spectrum = across @ (patches @ cosine.T)[at].reshape(stacks.shape[1], -1)
+    spectrum = spectrum.reshape(stacks.shape[1], len(stacks), -1)
+    keep = np.abs(spectrum) > THRESHOLD * sigma
+    keep[0, :, 0] = True
+    spectrum *= keep
+    weight = 1 / keep.sum(axis=(0, 2), dtype=np.float32)
     spectrum *= weight[:, None]
     back = (across @ spectrum.reshape(stacks.shape[1], -1)).reshape(len(at), -1)
     # which stacks each patch is in

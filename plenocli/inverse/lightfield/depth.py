@@ -4,9 +4,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from plenocli.base.tiling import bands
 from plenocli.inverse.lightfield.planes import DepthMap
 from plenocli.inverse.lightfield.refocus import STEP, in_colour, place, refocus
-from plenocli.inverse.lightfield.samples import Samples
+from plenocli.inverse.lightfield.samples import AT_ONCE, Samples
 
 ROUNDS = 4
 """Corrections of a depth map by least squares."""
@@ -229,8 +230,10 @@ def _disagreement(
     if channels is not None and channels.wavelengths is not None:
         found = _uncorrelated(in_colour(samples, slope, shape, step=2), width)
     else:
-        each = [_variance(samples.where(some), slope, shape, width) for some in parts if some.any()]
-        weights = np.ones(1) if channels is None else channels.weights[[s.any() for s in parts]]
+        colours = [samples.where(some) for some in parts]
+        lit = [len(colour.value) > 0 for colour in colours]
+        each = [_variance(c, slope, shape, width) for c, some in zip(colours, lit) if some]
+        weights = np.ones(1) if channels is None else channels.weights[lit]
         share = np.isfinite(each) * weights[:, None, None]
         with np.errstate(invalid="ignore"):
             total = (np.nan_to_num(each) * share).sum(axis=0)
@@ -310,8 +313,9 @@ def _correction(
     weights = np.ones(1) if samples.channels is None else samples.channels.weights
     top, bottom = np.zeros(shape), np.zeros(shape)
     for some, weight in zip(samples.parts(), weights, strict=True):
-        if some.any():
-            slant, square = _slants(samples.where(some), slope, shape)
+        colour = samples.where(some)
+        if len(colour.value):
+            slant, square = _slants(colour, slope, shape)
             top += weight * slant
             bottom += weight * square
     top, bottom = (gaussian_filter(part, width, mode="constant") for part in (top, bottom))
@@ -329,16 +333,16 @@ def _slants(
     own = _own(samples, slope)
     picture, _ = refocus(samples, own, shape, step=STEP)
     picture = np.where(np.isfinite(picture), picture, np.nanmean(picture))
-    where = place(samples, own, STEP).T
-    value, down, right = (
-        map_coordinates(layer, where, order=1, mode="nearest")
-        for layer in (picture, *np.gradient(picture))
-    )
-    along = (down * samples.offset[:, 0] + right * samples.offset[:, 1]) * (STEP / samples.pitch)
-    cell = np.clip((samples.centre / samples.pitch).astype(int), 0, np.array(shape) - 1)
-    index = cell[:, 0] * shape[1] + cell[:, 1]
-    first, second = (
-        np.bincount(index, w, shape[0] * shape[1]).reshape(shape)
-        for w in ((samples.value - value) * along, along**2)
-    )
-    return first, second
+    layers, sums = (picture, *np.gradient(picture)), np.zeros((2, shape[0] * shape[1]))
+    for some in bands(len(samples.value), AT_ONCE):
+        part = samples.where(some)
+        where = place(part, own[some], STEP).T
+        value, down, right = (
+            map_coordinates(layer, where, order=1, mode="nearest") for layer in layers
+        )
+        along = (down * part.offset[:, 0] + right * part.offset[:, 1]) * (STEP / part.pitch)
+        cell = np.clip((part.centre / part.pitch).astype(int), 0, np.array(shape) - 1)
+        index = cell[:, 0] * shape[1] + cell[:, 1]
+        for total, weights in zip(sums, ((part.value - value) * along, along**2)):
+            total += np.bincount(index, weights, sums.shape[1])
+    return sums[0].reshape(shape), sums[1].reshape(shape)

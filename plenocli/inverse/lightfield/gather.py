@@ -10,14 +10,16 @@ import numpy as np
 from plenocli.base.budget import budget
 from plenocli.base.errors import InputError
 from plenocli.forward.sensor.cfa import cfa_map
-from plenocli.inverse.lightfield.samples import Channels, Samples, collect, joined
+from plenocli.inverse.lightfield.samples import AT_ONCE, Channels, Samples, collect, joined
 
 if TYPE_CHECKING:
     from plenocli.forward.sensor.capture import Capture
     from plenocli.inverse.calibration.calibration import Calibration
 
-PIXEL_BYTES, PLANE_BYTES = 126, 1
-"""Memory for each pixel of the capture, and for each of its pixels and each plane (measured)."""
+PIXEL_BYTES, PLANE_BYTES, TEMPORARY_BYTES = 92, 1, 34
+"""Memory for each pixel of the capture, for each of its pixels and each plane, and for each of the
+pixels that are worked on together (measured).
+"""
 
 
 def samples_of(
@@ -41,7 +43,8 @@ def samples_of(
     docs/model.md, "Refocusing and depth".
     """
     budget().require(
-        capture.mosaic.size * (PIXEL_BYTES + PLANE_BYTES * planes),
+        capture.mosaic.size * (PIXEL_BYTES + PLANE_BYTES * planes)
+        + min(capture.mosaic.size, AT_ONCE) * TEMPORARY_BYTES,
         "refocusing",
         capture.metadata.path,
         "cut the capture",

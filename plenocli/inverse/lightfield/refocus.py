@@ -3,7 +3,8 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
-from plenocli.inverse.lightfield.samples import Samples
+from plenocli.base.tiling import bands
+from plenocli.inverse.lightfield.samples import AT_ONCE, Samples
 
 STEP = 4
 """Points of a refocused picture per lenslet pitch."""
@@ -83,17 +84,18 @@ def refocus(
     """
     from scipy.ndimage import convolve1d
 
-    where = place(samples, slope, step)
     rows, columns = shape[0] * step, shape[1] * step
-    low = np.floor(where).astype(int)
-    part = where - low
-    sums = np.zeros((3, rows * columns))
-    for down in (0, 1):
-        for right in (0, 1):
+    sums, each = np.zeros((3, rows * columns)), np.asarray(slope, float)
+    for some in bands(len(samples.value), AT_ONCE):
+        values = samples.value[some]
+        where = place(samples.where(some), each[some] if each.ndim else each, step)
+        low = np.floor(where).astype(int)
+        part = where - low
+        for down, right in np.ndindex(2, 2):
             r, c = low[:, 0] + down, low[:, 1] + right
             share = np.abs(1 - down - part[:, 0]) * np.abs(1 - right - part[:, 1])
             inside = (r >= 0) & (r < rows) & (c >= 0) & (c < columns)
-            index, share, value = (r * columns + c)[inside], share[inside], samples.value[inside]
+            index, share, value = (r * columns + c)[inside], share[inside], values[inside]
             for total, weights in zip(sums, (share, share * value, share * value**2)):
                 total += np.bincount(index, weights, rows * columns)
     tent = 1 - np.abs(np.arange(1 - step, step)) / step

@@ -5,6 +5,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from plenocli.base.tiling import bands
+
+AT_ONCE = 1 << 21
+"""Samples, or pixels for them, that are worked on together: temporary arrays are no larger."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Channels:
@@ -46,8 +51,8 @@ class Samples:
         """Farthest usable pixel from its centre, px: half of the pupil's image."""
         return float(np.sqrt((self.offset**2).sum(axis=1).max()))
 
-    def where(self, some: np.ndarray) -> "Samples":
-        """Those of the samples that `some` (sample,) bool says."""
+    def where(self, some: np.ndarray | slice) -> "Samples":
+        """Those of the samples that `some` says, (sample,) bool or a slice."""
         channel = None if self.channel is None else self.channel[some]
         return replace(
             self,
@@ -57,21 +62,22 @@ class Samples:
             channel=channel,
         )
 
-    def parts(self) -> list[np.ndarray]:
-        """Which samples (sample,) bool each channel has; of grey ones all."""
+    def parts(self) -> list[np.ndarray | slice]:
+        """Which samples each channel has; of grey ones all."""
         if self.channels is None or self.channel is None:
-            return [np.ones(len(self.value), bool)]
+            return [slice(None)]
         return [self.channel == number for number in range(len(self.channels.names))]
 
 
-def joined(parts: Sequence[Samples], channels: Channels) -> Samples:
-    """Samples of all channels: one part a channel, in their order."""
+def joined(parts: Sequence[Samples], channels: Channels | None = None) -> Samples:
+    """Samples of all parts in their order, one part a channel where there are channels."""
+    channel = np.repeat(np.arange(len(parts)), [len(part.value) for part in parts])
     return Samples(
         centre=np.concatenate([part.centre for part in parts]),
         offset=np.concatenate([part.offset for part in parts]),
         value=np.concatenate([part.value for part in parts]),
         pitch=parts[0].pitch,
-        channel=np.repeat(np.arange(len(parts)), [len(part.value) for part in parts]),
+        channel=None if channels is None else channel,
         channels=channels,
     )
 
@@ -93,6 +99,18 @@ def collect(
     threshold: a pixel counts where white is above this share of the brightest of its superpixel,
         and within half a pitch.
     """
+    rows = bands(len(centres), int(AT_ONCE / (centres.shape[1] * pitch**2)))
+    return joined([_collected(signal, white, centres[r], valid[r], pitch, threshold) for r in rows])
+
+
+def _collected(
+    signal: np.ndarray,
+    white: np.ndarray,
+    centres: np.ndarray,
+    valid: np.ndarray,
+    pitch: float,
+    threshold: float,
+) -> Samples:
     half = int(pitch // 2)
     steps = np.arange(-half, half + 1)
     near = np.rint(np.where(np.isfinite(centres), centres, -1e6)).astype(int)

@@ -3,6 +3,9 @@
 import numpy as np
 import pytest
 
+from plenocli.inverse.lightfield import depth as depth_module
+from plenocli.inverse.lightfield import refocus as refocus_module
+from plenocli.inverse.lightfield import samples as samples_module
 from plenocli.inverse.lightfield.depth import depth
 from plenocli.inverse.lightfield.light_field import refocused, usual_slopes
 from plenocli.inverse.lightfield.planes import distance_of, slope_of
@@ -237,3 +240,16 @@ def test_confidence_is_how_often_the_slope_is_right_and_sigma_how_far_it_is_off(
     assert np.quantile(away[known], 0.68) < 1 and np.quantile(away[known], 0.95) < 3.5
     # edges are where the near thing ends, not all over
     assert edges[near_edge & known].mean() > 0.25 > 10 * edges[~near_edge & known].mean()
+
+
+def test_how_many_samples_are_worked_on_together_changes_nothing(monkeypatch):
+    mosaic = capture(0.62, 0.5)
+    whole = samples(mosaic)
+    map_of_all = depth(whole, usual_slopes(7).tolist(), (COUNT, COUNT))
+    for module in (depth_module, refocus_module, samples_module):
+        monkeypatch.setattr(module, "AT_ONCE", 3001)
+    parts = samples(mosaic)
+    for name in ("centre", "offset", "value"):
+        np.testing.assert_array_equal(getattr(parts, name), getattr(whole, name))
+    found = depth(parts, usual_slopes(7).tolist(), (COUNT, COUNT))
+    np.testing.assert_allclose(found.slope, map_of_all.slope, atol=1e-5)

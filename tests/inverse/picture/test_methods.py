@@ -105,7 +105,7 @@ def test_a_tile_takes_over_what_its_whole_knows():
 
     whole = Whole({"unit": {None: 7}})
     assert piece([1, 3], None) == piece([1, 3], whole) == (2, 3, 2)
-    beside = whole.without_means()
+    beside = whole.for_means()
     assert piece([5, 5, 8], beside) == (6, 3, 3)
     assert whole.closed_with([]).found == whole.found
     tile = whole.closed_with([beside, Whole({})])

@@ -99,18 +99,11 @@ def collect(
     threshold: a pixel counts where white is above this share of the brightest of its superpixel,
         and within half a pitch.
     """
-    rows = bands(len(centres), int(AT_ONCE / (centres.shape[1] * pitch**2)))
-    return joined([_collected(signal, white, centres[r], valid[r], pitch, threshold) for r in rows])
-
-
-def _collected(
-    signal: np.ndarray,
-    white: np.ndarray,
-    centres: np.ndarray,
-    valid: np.ndarray,
-    pitch: float,
-    threshold: float,
-) -> Samples:
+    parts = bands(len(centres), int(AT_ONCE / (centres.shape[1] * pitch**2)))
+    if len(parts) > 1:
+        return joined(
+            [collect(signal, white, centres[r], valid[r], pitch, threshold) for r in parts]
+        )
     half = int(pitch // 2)
     steps = np.arange(-half, half + 1)
     near = np.rint(np.where(np.isfinite(centres), centres, -1e6)).astype(int)

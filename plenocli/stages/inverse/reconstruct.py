@@ -567,7 +567,8 @@ def _in_tiles(
         recipe=recipe, capture=capture, finer=finer, model_error=_off(limits), whole=whole
     )
     others = tiles if method.weighs_all else spread_over(source.count, side_of(system))
-    sample, seen = task.sample(estimators, data)
+    data, cause = replace(data, whole=whole), partial(likely_cause, estimators)
+    sample, seen = estimate(estimators, method, data, model_error=_off(limits), explain=cause)
     task = task.sharing(pool, others)
     depends = replace(settings, workers=1), recipe.digests, file_digest(capture), tiles
     bench = Bench.beside(target, depends)
@@ -607,14 +608,6 @@ class _TileTask:
     model_error: float
     whole: Whole
 
-    def sample(
-        self, estimators: Estimators, data: Superpixels
-    ) -> tuple[Reconstruction, Seen | None]:
-        """(the picture of `data`, the piece that stands for the whole, what is seen in it)."""
-        method, data = METHODS[self.recipe.settings.method], replace(data, whole=self.whole)
-        cause = partial(likely_cause, estimators)
-        return estimate(estimators, method, data, model_error=self.model_error, explain=cause)
-
     def sharing(self, pool: Pool, pieces: Sequence[Tile]) -> _TileTask:
         """The task that knows the whole, what `pieces` share beside the sample in it."""
         found = {}
@@ -637,8 +630,7 @@ class _TileTask:
 
     def __call__(self, job: tuple[int, Tile]) -> SolvedTile:
         """A tile."""
-        tile = job[1]
-        found = self._estimated(tile, self.whole)
+        tile, found = job[1], self._estimated(job[1], self.whole)
         sigma = None if found.sigma is None else found.sigma[tile.within]
         value, trace = found.value[tile.within], found.trace
         return SolvedTile(value=value, sigma=sigma, trace=trace, stats=found.stats)
@@ -647,13 +639,12 @@ class _TileTask:
         """A piece; what there is to say was said of the whole."""
         recipe = self.recipe
         estimators = (_finer(recipe) if self.finer else None) or _estimators(recipe)
-        opened = superpixel_source(
-            self.capture, estimators.system, recipe.calibration, verify=False
-        )
+        method, system = METHODS[recipe.settings.method], estimators.system
         with collected_notes():
-            with opened as source:
+            with superpixel_source(
+                self.capture, system, recipe.calibration, verify=False
+            ) as source:
                 data = replace(source.cut(*tile.around, tile.within), whole=whole)
-            method = METHODS[recipe.settings.method]
             return estimate(estimators, method, data, model_error=self.model_error)[0]
 
 

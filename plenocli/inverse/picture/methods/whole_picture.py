@@ -104,7 +104,9 @@ def _from_lmmse(
     error = float(np.sqrt(light.data.common("start", lambda: np.mean(sigma[inner] ** 2))))
     found, rule, rounds = x.copy(), "", 0
     if not (light.data.whole and light.data.whole.only_means):
-        near, held = _near(light.data.own, y.shape, -(-LOOK // min(shape))), None
+        reach, held = -(-LOOK // min(shape)), None
+        own = (part.indices(n) for part, n in zip(light.data.own, y.shape))
+        near = tuple(slice(max(0, first - reach), last + reach) for first, last, _ in own)
         if joint is not None:
             edge = np.ones(y.shape[:2], bool)
             edge[inner] = False
@@ -118,15 +120,6 @@ def _from_lmmse(
         sigma=sigma,
         from_lmmse=root_mean_square(found - x),
         stats=WholePictureStats(expected_error=error, rounds=rounds, rule=rule, wide=wide),
-    )
-
-
-def _near(own: tuple[slice, slice], count: tuple[int, ...], reach: int) -> tuple[slice, slice]:
-    """Lenslets of a tile that its own and those up to `reach` beside them are, of `count`."""
-    rows, columns = (part.indices(n)[:2] for part, n in zip(own, count))
-    return (
-        slice(max(0, rows[0] - reach), rows[1] + reach),
-        slice(max(0, columns[0] - reach), columns[1] + reach),
     )
 
 

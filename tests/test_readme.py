@@ -122,3 +122,12 @@ def test_every_row_of_limits_names_a_test_that_is_there():
         known = [ROOT / "tests" / name for name in named]
         known = [p if "/" in n else ROOT / "tests" / folder / n for p, n in zip(known, named)]
         assert named and all(path.is_file() for path in known), row
+
+
+def test_each_row_of_the_limits_names_tests_that_are_there():
+    rows = (ROOT / "README.md").read_text().partition("\n## Limits\n")[2].partition("\n## ")[0]
+    for row in rows.splitlines()[5:]:
+        named = re.findall(r"`([\w/]*test_\w+\.py)`", row)
+        assert named or not row, row
+        for name in named:
+            assert any((ROOT / "tests" / room / name).exists() for room in ("", "faults")), name

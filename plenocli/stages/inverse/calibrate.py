@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from plenocli.base.budget import budget
 from plenocli.base.errors import UsageError
 from plenocli.base.progress import note
 from plenocli.files.read.series import read_series, true_centres
@@ -24,6 +25,8 @@ Name = str | Path
 
 GRID_ERROR = 0.1
 """px rms, the expected error up to which a grid from scenes is accepted unasked."""
+_GRID_BYTES = 24
+"""A pixel, that finding the lenslets of a white image takes."""
 ASTRAY = 1.0
 """px rms by which centres may miss those that a simulated capture knows before a warning."""
 
@@ -164,6 +167,8 @@ def run_calibrate(
     roles |= camera_files(camera, description) if camera and description else {}
     cfa = cfa or (description.sensor.cfa if description else None)
     captures = read_series([*whites, *scenes], cfa=cfa)
+    needed = _GRID_BYTES * captures[0].mosaic.size
+    budget().require(needed, "finding the lenslets", [*whites, *scenes][0], "crop the captures")
     white = captures[: len(whites)]
     found = calibrate(
         white,

@@ -175,7 +175,8 @@ def _mosaic(path: str, raw: Any) -> dict[str, Any]:
     }
     if colours.shape[0] >= 2 and colours.shape[1] >= 2:
         indices = colours[:2, :2].astype(int)
-        repeats = all((colours[i::2, j::2] == indices[i, j]).all() for i in (0, 1) for j in (0, 1))
+        corner = colours[:48, :48]  # LibRaw's patterns repeat every 16 pixels at most
+        repeats = all((corner[i::2, j::2] == indices[i, j]).all() for i in (0, 1) for j in (0, 1))
         found |= {"indices": indices.tolist(), "repeats": repeats}
     return found
 

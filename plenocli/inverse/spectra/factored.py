@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from plenocli.forward.sensor.noise import Noise
     from plenocli.inverse.calibration.calibration import MadeResponses
 
-BLOCK_NUMBERS = 90_000, 45_000
+BLOCK_NUMBERS = 270_000, 45_000
 """Pixels of a block, one basis for all or one each: what belongs to it stays in a core's cache."""
 FACTOR_NUMBERS = 250_000
 """Numbers of responses that are factored together."""

@@ -298,6 +298,8 @@ def _described(
     shift = family.geometry_at(values).pixel_shift or (0.0, 0.0)
     if accepted and max(map(abs, shift)) > 0.5:
         accepted, why = False, "superpixels would be off by more than half a pixel"
+    if accepted and error > 1:
+        accepted, why = False, "the noise told leaves nothing known of the matrix"
     camera = family.camera
     if accepted:
         try:

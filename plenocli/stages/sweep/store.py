@@ -95,13 +95,8 @@ class Store:
         """
         from plenocli.execution.journal import Journal
 
-        self.folder, self.output, self.plot, self.overwrite, self.again = (
-            folder,
-            output,
-            plot,
-            overwrite,
-            again,
-        )
+        self.folder, self.output, self.plot = folder, output, plot
+        self.overwrite, self.again = overwrite, again
         try:
             folder.mkdir(exist_ok=True)
             self.journal = Journal(folder / "points.jsonl")

@@ -25,7 +25,7 @@ from plenocli.inverse.picture.methods.method import Method, Sees
 from plenocli.inverse.picture.nuisances.clean import Cleaned, clean
 from plenocli.inverse.picture.nuisances.veil import VeilFound
 from plenocli.inverse.picture.reconstruction import Reconstruction
-from plenocli.inverse.picture.trust.believe import SURE, Belief, believe
+from plenocli.inverse.picture.trust.believe import MOVED, Belief, believe
 from plenocli.inverse.picture.trust.guard import guarded
 from plenocli.inverse.picture.trust.noise_level import NoiseLevel, noise_level
 
@@ -171,8 +171,9 @@ def estimate(
 
 def _cleaned(estimators: Estimators, piece: Superpixels) -> Cleaned:
     """The capture without its nuisances. Neighbours' light that block means take away badly looks
-    like a veil: where the matrix knows it, a veil is believed only if LMMSE over 3x3 lenslets
-    leaves less over without it.
+    like a veil, and so does what a wrong matrix leaves: where the matrix knows neighbours, a veil
+    is believed only if LMMSE over 3x3 lenslets leaves less over without it, else only if the
+    matrix is believed without it.
     """
     tried: list[Cleaned] = []
 
@@ -184,17 +185,26 @@ def _cleaned(estimators: Estimators, piece: Superpixels) -> Cleaned:
         bare = clean(estimators, data)
         tried.append(bare)
         veiled = any(isinstance(f, VeilFound) and f.removed for f in bare.findings)
-        if not (veiled and estimators.coupled and estimators.overlap == 3):
+        if not veiled:
             return True
         other = clean(estimators, data, veil=False)
-        if data.noise is not None and left(bare) < left(other):
-            return True
-        tried.append(other)
-        return False
+        if estimators.coupled and estimators.overlap == 3:
+            believed = data.noise is not None and left(bare) < left(other)
+        else:
+            level = _noise(estimators, bare.data, bare.data.y)
+            believed = believe(estimators, bare.data.y, level, data.scene).right
+        if not believed:
+            tried.append(other)
+        return believed
 
     believed = piece.common("veil believed", veil_believed)
     # of a piece, what is common to all pieces is asked for again
     return tried[-1] if piece.whole is None else clean(estimators, piece, veil=believed)
+
+
+def _noise(estimators: Estimators, data: Superpixels, own: np.ndarray) -> NoiseLevel:
+    """The noise of a capture, of which `own` is without the neighbours' light."""
+    return noise_level(data.y, estimators.options.noise_sigma, data.sigma, estimators.svd, own)
 
 
 def _tell_of(bare: Cleaned) -> None:
@@ -247,10 +257,9 @@ def _settle(
     """The noise of a capture, by the light of each lenslet alone: that of the neighbours is taken
     away, as the joint estimate with the noise as told sees it.
     """
-    given, svd = estimators.options.noise_sigma, estimators.svd
     takes_away = estimators.coupled and estimators.overlap == 3
     plain = estimators.without_stray(data.y) if takes_away else data.y
-    level = data.common("noise", lambda: noise_level(data.y, given, data.sigma, svd, plain))
+    level = data.common("noise", lambda: _noise(estimators, data, plain))
     told = replace(data, noise=Noise.of_sigma(level.sigma))
     if not takes_away:
         jointly = method.makes_joint_estimate(estimators)
@@ -281,9 +290,9 @@ def _tell(belief: Belief, model_error: float, cause: str | None, *, coupled: boo
         advice += "; neighbours' light takes a pif of --superpixels 3x3 and --overlap 3"
     if level.found is not None and level.found > level.sigma:
         against.append(f"what it cannot produce is {level.found / level.sigma:.3g} times the noise")
-    if belief.moved > SURE:
+    if belief.moved > MOVED:
         against.append(
-            "what is left over is the picture's own light, displaced "
+            "it is likelier that the picture's light is displaced "
             f"({belief.moved:.2g} standard deviations)"
         )
     if belief.displaced:

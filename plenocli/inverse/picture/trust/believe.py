@@ -27,7 +27,11 @@ from plenocli.inverse.picture.trust.continuity import (
     relative_factor,
 )
 from plenocli.inverse.picture.trust.excess import even_light, with_excess, without_pattern
-from plenocli.inverse.picture.trust.moved_light import moved_even_light, moved_rest
+from plenocli.inverse.picture.trust.moved_light import (
+    moved_even_light,
+    moved_light,
+    moved_within,
+)
 from plenocli.inverse.picture.trust.noise_level import NoiseLevel
 from plenocli.inverse.picture.trust.rough_scene import dark, spoilt_by_matrix
 
@@ -46,14 +50,14 @@ MISFIT = 1.5
 """What the joint estimate leaves over, in terms of the noise, where the matrix is right, at the
 most: light from beyond the array is in it.
 """
-SURE, HINT = 4.0, 2.5
-"""Standard deviations of chance from which on noise found over the capture's own, or light that
-moved, speaks against the matrix by itself, and from which on beside a picture that may not go on
+SURE, MOVED, HINT = 4.0, 3.2, 2.5
+"""Standard deviations of chance from which on noise found over the capture's own, and light that
+moved, speak against the matrix by themselves, and from which on beside a picture that may not go on
 across borders.
 """
-CHANCE = 1.0
-"""Standard deviations of chance that a factor is allowed where nothing else is found, and that are
-taken off where the matrix is not believed.
+CHANCE, ALLOWED = 1.0, 0.5
+"""Standard deviations of chance that are taken off a factor where the matrix is not believed, and
+that it is allowed where nothing else is found: the less, the more of light that moved there is.
 """
 LEAST_PAIRS = 8
 """Borders between lenslets that it takes to judge continuity."""
@@ -77,7 +81,7 @@ class Belief:
     reference: factor of these photographs, for what is made with the noise that is believed; None
         where it is no measure: too few lenslets, or a scene that jumps everywhere.
     raised: root mean square over the coordinates in use of the noise over that of a pixel.
-    moved: standard deviations of light that moved, see `moved_rest`.
+    moved: standard deviations of light that moved, see `moved_light`.
     pattern: (pixel,) what even light of brightness 1 makes beside what the matrix says, None where
         that is nothing.
     displaced: standard deviations of even light that moved, see `moved_even_light`; 0 where it is
@@ -132,11 +136,11 @@ def believe(
     chance = 1 / np.sqrt(2 * max(dark(estimators.svd) * stacked.shape[1], 1))
     found = beyond > MISTOLD + SURE * chance or model_error * root_mean_square(y) > level.sigma
     system, svd = estimators.system, estimators.svd
-    moved = 0.0 if coupled else moved_rest(system, svd, lmmse, stacked, level.sigma)
-    found = found or moved > SURE
-    quiet = beyond <= HINT * chance and moved <= HINT and not displaced
-    least = None if first is None else first.most if quiet else first.relative
-    continuous = least is None or least >= CONTINUOUS
+    moved = 0.0 if coupled else moved_light(system, svd, lmmse, stacked, level.sigma)
+    found = found or moved > MOVED
+    quiet = beyond <= HINT * chance and not displaced
+    allowed = ALLOWED * float(np.clip(1 - moved / HINT, 0, 1)) if quiet else 0.0
+    continuous = first is None or first.most(allowed) >= CONTINUOUS
     rough = (
         first is not None
         and not continuous
@@ -166,12 +170,18 @@ def believe(
         raised = _calmer(raised, stacked, now)
         now = judge.of_lmmse(raised)
     power = float(np.mean(raised.noise)) if len(raised.noise) else level.sigma**2
+    reference = None
+    if now is not None and first is not None:
+        # jumps are excused by photographs' as far as they are not the matrix's
+        still = not coupled and moved_within(system, raised, stacked) > MOVED
+        share = 0.0 if still else float(np.clip(first.relative / CONTINUOUS, 0, 1))
+        reference = max(now.reference, LEAST_REFERENCE) ** share
     return Belief(
         level=level,
         lmmse=raised,
         right=False,
         continuity=None if first is None else first.relative,
-        reference=None if now is None else now.reference,
+        reference=reference,
         raised=float(np.sqrt(power)) / level.sigma,
         moved=moved,
         pattern=pattern if shown is None else pattern + shown,
@@ -190,11 +200,10 @@ class _Verdict:
     def relative(self) -> float:
         return relative_factor(self.found, self.right)
 
-    @property
-    def most(self) -> float:
-        """What the relative factor may be but for chance."""
+    def most(self, deviations: float = CHANCE) -> float:
+        """What the relative factor may be but for so many standard deviations of chance."""
         right = max(self.right.factor, LEAST_REFERENCE)
-        return self.relative + CHANCE * self.found.deviation / right
+        return self.relative + deviations * self.found.deviation / right
 
     @property
     def reference(self) -> float:
@@ -293,8 +302,8 @@ def _scene_jumps(
     return (
         level.found is not None
         and bool(dark(svd) >= ROOM * loud)
-        and verdict.most < (JUMPS if loud else JUMPS / 2)
-        and verdict.strongest.most < STRONGEST_JUMP
+        and verdict.most() < (JUMPS if loud else JUMPS / 2)
+        and verdict.strongest.most() < STRONGEST_JUMP
         and not spoilt_by_matrix(lmmse, y)
     )
 

@@ -215,7 +215,7 @@ def test_motions_are_derivatives_of_the_light_field():
         assert np.linalg.norm(found - exact) < 0.1 * np.linalg.norm(exact)
 
 
-@pytest.mark.parametrize("snr_db", [60, 30])
+@pytest.mark.parametrize("snr_db", [pytest.param(60, marks=pytest.mark.slow), 30])
 def test_noise_moves_nothing_whatever_the_scene_and_wherever_it_is_larger(snr_db):
     shared, rng, found = estimators(), np.random.default_rng(snr_db), []
     for picture in scenes(20, COUNT).values():

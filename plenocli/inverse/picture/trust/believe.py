@@ -162,20 +162,12 @@ def believe(
     stacked = y.reshape(-1, y.shape[-1]).T
     judge = None if judge is None else replace(judge, y=y)
     floor = level.sigma**2 if level.found is None else max(level.found, level.sigma) ** 2
-    raised = replace(lmmse, noise=with_excess(lmmse, stacked, floor))
-    now = None if judge is None else judge.of_lmmse(raised)
-    for _ in range(ROUNDS):
-        if judge is None or now is None or now.relative >= CONTINUOUS or not len(raised.power):
-            break
-        raised = _calmer(raised, stacked, now)
-        now = judge.of_lmmse(raised)
+    raised, now = _raised(judge, replace(lmmse, noise=with_excess(lmmse, stacked, floor)), stacked)
     power = float(np.mean(raised.noise)) if len(raised.noise) else level.sigma**2
     reference = None
     if now is not None and first is not None:
-        # jumps are excused by photographs' as far as they are not the matrix's
         still = not coupled and moved_within(system, raised, stacked) > MOVED
-        share = 0.0 if still else float(np.clip(first.relative / CONTINUOUS, 0, 1))
-        reference = max(now.reference, LEAST_REFERENCE) ** share
+        reference = _excused(first, now, still)
     return Belief(
         level=level,
         lmmse=raised,
@@ -306,6 +298,27 @@ def _scene_jumps(
         and verdict.strongest.most() < STRONGEST_JUMP
         and not spoilt_by_matrix(lmmse, y)
     )
+
+
+def _raised(judge: _Judge | None, raised: Lmmse, y: np.ndarray) -> tuple[Lmmse, _Verdict | None]:
+    """(the same with noise raised until pictures go on, the verdict then); y (pixel, signal)."""
+    now = None if judge is None else judge.of_lmmse(raised)
+    for _ in range(ROUNDS):
+        if judge is None or now is None or now.relative >= CONTINUOUS or not len(raised.power):
+            break
+        raised = _calmer(raised, y, now)
+        now = judge.of_lmmse(raised)
+    return raised, now
+
+
+def _excused(first: _Verdict, now: _Verdict, moved: bool) -> float:
+    """Factor that the jumps of a picture are excused with: photographs', as far as the matrix is
+    not their cause.
+
+    first, now: before and after noise was raised; moved: whether light still moves then.
+    """
+    share = 0.0 if moved else float(np.clip(first.relative / CONTINUOUS, 0, 1))
+    return max(now.reference, LEAST_REFERENCE) ** share
 
 
 def _calmer(lmmse: Lmmse, y: np.ndarray, verdict: _Verdict) -> Lmmse:

@@ -299,7 +299,7 @@ def _described(
     if accepted and max(map(abs, shift)) > 0.5:
         accepted, why = False, "superpixels would be off by more than half a pixel"
     if accepted and error > 1:
-        accepted, why = False, "the noise told leaves nothing known of the matrix"
+        accepted, why = False, "tells nothing of the matrix under the noise told"
     camera = family.camera
     if accepted:
         try:

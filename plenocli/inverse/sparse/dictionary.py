@@ -4,20 +4,9 @@ Algorithm 1), made sound.
 Each iteration draws a batch X of clean training patches, measures them with noise, Y = A X + n,
 codes Y sparsely with D = A Phi, and then refits Phi to the clean patches: min (1/B)|X - Phi C|^2 +
 delta |A Phi|^2, columns normalised. A is scaled to unit spectral norm and x lies in [0, 1]: lambda
-and delta mean nothing before that. Where the paper is silent or its pseudo-code does not work:
-- atom 0 is constant and free of the penalty (nearly all light is in the mean, which the total flux
-  fixes well); all other atoms have zero mean, so that it is not learnt over and over;
-- the dictionary step is solved in closed form (a Sylvester equation), drawn towards the atoms so
-  far, because few patches of a batch use an atom (`pulled`), and its normal equations are checked;
-  the paper's gradient steps are there beside it (`gradient_step`);
-- atoms that the sensor sees alike are drawn apart (`decorrelated`), which the paper's term does not
-  do: it makes atoms fainter to the sensor, not less alike;
-- directions in which the sensor sees less than a hundredth of the noise's power are left
-  out of the coding;
-- atoms that no patch of the batch used are replaced by training patches;
-- iteration i draws from its own random stream, so a resumed run equals an
-  uninterrupted one bit for bit;
-- progress is measured on a fixed validation batch, since each iteration has another objective.
+and delta mean nothing before that. Atom 0 is constant and free of the penalty, all others have zero
+mean. Iteration i draws from its own random stream, so a resumed run equals an uninterrupted one bit
+for bit. What the paper leaves open: docs/model.md, "Spatial reconstruction".
 """
 
 from __future__ import annotations

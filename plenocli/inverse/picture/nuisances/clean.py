@@ -13,8 +13,9 @@ import numpy as np
 
 from plenocli.base.errors import PlenoError
 from plenocli.base.progress import note
+from plenocli.forward.sensor.noise import Noise
 from plenocli.inverse.picture.estimators import Estimators, root_mean_square
-from plenocli.inverse.picture.joint import own_light
+from plenocli.inverse.picture.joint import estimate_jointly, own_light
 from plenocli.inverse.picture.lenslet_model import Common, Shared, Superpixels
 from plenocli.inverse.picture.nuisances.defects import (
     NORMAL,
@@ -121,6 +122,7 @@ def clean(
     inner[estimators.inner(data.y.shape[:2])] = True
     task = _Task(
         estimators=estimators,
+        data=data,
         common=data.common,
         lmmse=lmmse,
         model=model,
@@ -200,6 +202,7 @@ class _Found:
 class _Task:
     """What is looked for, and with what.
 
+    data: the capture.
     common: gives what superpixels that are a part have in common.
     unknown, clipped: (lenslet, pixel).
     blind, inner, counted: (lenslet,), those given up, those that have all their neighbours, and
@@ -209,6 +212,7 @@ class _Task:
     """
 
     estimators: Estimators
+    data: Superpixels
     common: Common
     lmmse: Lmmse
     model: PixelModel
@@ -270,11 +274,15 @@ class _Task:
     def _own_light(self, y: np.ndarray) -> np.ndarray:
         """Superpixels y (lenslet_row, lenslet_column, pixel) without the neighbours' light, as
         LMMSE of each lenslet sees the neighbours: first without the light that block means tell,
-        then again without what it told itself.
+        then again without what it told itself. Of several bands, in which neighbours may be quite
+        unlike, as the joint estimate sees them.
         """
         own = self.estimators.without_stray(y)
         if not self.estimators.coupled:
             return own
+        if len(self.estimators.system.bands) > 1:
+            seen = replace(self.data, y=y, noise=Noise.of_sigma(self.model.sigma))
+            return own_light(self.estimators, y, estimate_jointly(self.estimators, seen).value)
         for k in range(STRAY_ROUNDS):
             stacked = own.reshape(-1, own.shape[2]).T
             misfit = self.common("misfit", partial(self._misfit, stacked), k)

@@ -350,3 +350,36 @@ def test_a_method_that_does_not_look_says_what_is_saturated():
     assert np.array_equal(found.data.y, data.y)
     assert "the picture is too dark there" in found.findings[0].sentence
     assert found.findings[0].pixels == np.count_nonzero(above)
+
+
+@pytest.mark.parametrize("alike", [False, True], ids=["told apart", "bands alike"])
+def test_unlike_neighbours_in_several_bands_are_no_defects(alike):
+    """Every lenslet another even patch in each band, and a quarter of the light beside; one pixel
+    is dead. Bands that light does not tell apart end in no error.
+    """
+    rng = np.random.default_rng(8)
+    own = np.concatenate([blurred(-1.5), blurred(-1.5 if alike else 1.5)], axis=1)
+    offsets = np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)])
+    far = [np.roll(own.reshape(PIXELS, PIXELS, -1), 3 * o, (0, 1)) for o in offsets]
+    blocks = np.array([0.03 * part.reshape(own.shape) for part in far])
+    blocks[4] = own
+    system = LensletMatrix(
+        path=Path("pif.h5"),
+        blocks=blocks,
+        offsets=offsets,
+        pixel_shape=(PIXELS, PIXELS),
+        object_shape=(N, N),
+        bands=(5e-7, 6e-7),
+    )
+    smooth = rng.standard_normal((120, 120)).cumsum(0).cumsum(1)
+    smooth = (smooth - smooth.min()) / np.ptp(smooth)
+    estimators = Estimators(system, Options(method="lmmse"), lambda scene: [("walk", smooth)])
+    x = np.repeat(rng.uniform(0.02, 0.98, (9, 9, 2)), N * N, axis=2)
+    y = sum(x[1 - r : 8 - r, 1 - c : 8 - c] @ b.T for (r, c), b in zip(offsets, blocks))
+    y = y + SIGMA * rng.standard_normal(y.shape)
+    y[3, 3, 40] = 0.0
+    cleaned = clean(estimators, Superpixels(y=y, noise=Noise.of_sigma(SIGMA)))
+    told = {}
+    for finding in cleaned.findings:
+        told |= finding.as_json()
+    assert told["defects"]["dark"] + told["defects"]["bright"] == 1

@@ -25,10 +25,11 @@ from plenocli.inverse.picture.trust import believe
 from plenocli.inverse.picture.trust.continuity import Jumps, group_factors, jumps
 from plenocli.inverse.picture.trust.excess import even_light, with_excess
 from plenocli.inverse.picture.trust.moved_light import (
+    _deviations,
+    _within,
     motions,
     moved_even_light,
     moved_light,
-    moved_within,
 )
 from plenocli.inverse.picture.trust.rough_scene import spoilt_by_matrix
 from plenocli.inverse.sparse.dictionary import Dictionary, Learner, Settings
@@ -253,7 +254,7 @@ def test_what_moves_within_the_reach_of_the_matrix_is_told_from_unusual_scenes()
         y = x.reshape(-1, 400) @ a.T
         sigma = np.sqrt(np.mean(y**2)) / 100
         y = y + sigma * np.random.default_rng(seed).standard_normal(y.shape)
-        return moved_within(system, shared.prior.lmmse(sigma, None), y.T)
+        return _deviations(*_within(system, shared.prior.lmmse(sigma, None), y.T))
 
     off = matrix(circles, ('distance = "550 mm"', 'distance = "551.1 mm"'))
     assert found(off, scene(), 1) > 4 > 2.5 > found(own, scene(), 1)

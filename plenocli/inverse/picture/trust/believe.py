@@ -27,11 +27,7 @@ from plenocli.inverse.picture.trust.continuity import (
     relative_factor,
 )
 from plenocli.inverse.picture.trust.excess import even_light, with_excess, without_pattern
-from plenocli.inverse.picture.trust.moved_light import (
-    moved_even_light,
-    moved_light,
-    moved_within,
-)
+from plenocli.inverse.picture.trust.moved_light import moved_even_light, moved_light
 from plenocli.inverse.picture.trust.noise_level import NoiseLevel
 from plenocli.inverse.picture.trust.rough_scene import dark, spoilt_by_matrix
 
@@ -57,7 +53,8 @@ across borders.
 """
 CHANCE, ALLOWED = 1.0, 0.5
 """Standard deviations of chance that are taken off a factor where the matrix is not believed, and
-that it is allowed where nothing else is found: the less, the more of light that moved there is.
+that it is allowed where nothing else is found: none where light moved, twice as many where it did
+not for sure.
 """
 LEAST_PAIRS = 8
 """Borders between lenslets that it takes to judge continuity."""
@@ -139,7 +136,7 @@ def believe(
     moved = 0.0 if coupled else moved_light(system, svd, lmmse, stacked, level.sigma)
     found = found or moved > MOVED
     quiet = beyond <= HINT * chance and not displaced
-    allowed = ALLOWED * float(np.clip(1 - moved / HINT, 0, 1)) if quiet else 0.0
+    allowed = ALLOWED * float(np.clip(1 - moved / HINT, 0, 2)) if quiet else 0.0
     continuous = first is None or first.most(allowed) >= CONTINUOUS
     rough = (
         first is not None
@@ -164,16 +161,12 @@ def believe(
     floor = level.sigma**2 if level.found is None else max(level.found, level.sigma) ** 2
     raised, now = _raised(judge, replace(lmmse, noise=with_excess(lmmse, stacked, floor)), stacked)
     power = float(np.mean(raised.noise)) if len(raised.noise) else level.sigma**2
-    reference = None
-    if now is not None and first is not None:
-        still = not coupled and moved_within(system, raised, stacked) > MOVED
-        reference = _excused(first, now, still)
     return Belief(
         level=level,
         lmmse=raised,
         right=False,
         continuity=None if first is None else first.relative,
-        reference=reference,
+        reference=None if now is None else now.reference,
         raised=float(np.sqrt(power)) / level.sigma,
         moved=moved,
         pattern=pattern if shown is None else pattern + shown,
@@ -309,16 +302,6 @@ def _raised(judge: _Judge | None, raised: Lmmse, y: np.ndarray) -> tuple[Lmmse, 
         raised = _calmer(raised, y, now)
         now = judge.of_lmmse(raised)
     return raised, now
-
-
-def _excused(first: _Verdict, now: _Verdict, moved: bool) -> float:
-    """Factor that the jumps of a picture are excused with: photographs', as far as the matrix is
-    not their cause.
-
-    first, now: before and after noise was raised; moved: whether light still moves then.
-    """
-    share = 0.0 if moved else float(np.clip(first.relative / CONTINUOUS, 0, 1))
-    return max(now.reference, LEAST_REFERENCE) ** share
 
 
 def _calmer(lmmse: Lmmse, y: np.ndarray, verdict: _Verdict) -> Lmmse:

@@ -56,13 +56,6 @@ def moved_light(
     return max(_deviations(slopes, chance), _deviations(slopes + more, chance + unusual))
 
 
-def moved_within(system: LensletMatrix, lmmse: Lmmse, y: np.ndarray) -> float:
-    """The same by what photographs give alone; system, lmmse, y: as in `moved_light`."""
-    if min(*system.pixel_shape, *system.object_shape) < 2:
-        return 0.0
-    return _deviations(*_within(system, lmmse, y[:, :: -(-y.shape[1] // LOOKED_AT)]))
-
-
 def _beyond(
     system: LensletMatrix, svd: Svd, lmmse: Lmmse, y: np.ndarray, sigma: float
 ) -> tuple[np.ndarray, np.ndarray]:

@@ -249,6 +249,29 @@ def _panel(low: float, high: float, ends: Callable, discs: Sequence[Disc], slope
     return y, wy, *ends(y)
 
 
+def opening_chords(
+    shape: str, nodes: int, angles: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Chords along x of a lenslet's opening, the rectangle around it scaled to [-1, 1]^2.
+
+    shape: "square", "circle" or "hexagon", with two flat sides facing +-x;
+    nodes: of a square's height, or of each of a hexagon's three panels; angles: of a circle.
+
+    Returns rows, weights and half lengths, (chord,).
+    """
+    t, w = gauss(nodes)
+    if shape == "square":
+        return t, w, np.ones(len(t))
+    if shape == "circle":
+        # equidistant angles converge spectrally, since the integrand is periodic in them
+        theta = (np.arange(angles) + 0.5) * np.pi / angles - np.pi / 2
+        return np.sin(theta), np.pi / angles * np.cos(theta), np.cos(theta)
+    panels = ((-1.0, -0.5), (-0.5, 0.5), (0.5, 1.0))
+    y = np.concatenate([(a + b) / 2 + (b - a) / 2 * t for a, b in panels])
+    weights = np.concatenate([(b - a) / 2 * w for a, b in panels])
+    return y, weights, np.minimum(1.0, 2 * (1 - np.abs(y)))
+
+
 @lru_cache(maxsize=16)
 def opening_weights(shape: str, count: int) -> np.ndarray:
     """Weights W with sum W_ij F(y_i, x_j) the integral of F over a lenslet's opening, for functions
@@ -264,16 +287,7 @@ def opening_weights(shape: str, count: int) -> np.ndarray:
     if shape == "square":
         found = np.outer(w, w)
     else:
-        if shape == "circle":
-            theta = (np.arange(2 * count + 16) + 0.5) * np.pi / (2 * count + 16) - np.pi / 2
-            y, half = np.sin(theta), np.cos(theta)
-            rows = np.pi / len(theta) * half
-        else:
-            s, ws = gauss(count + 4)
-            panels = ((-1.0, -0.5), (-0.5, 0.5), (0.5, 1.0))
-            y = np.concatenate([(a + b) / 2 + (b - a) / 2 * s for a, b in panels])
-            rows = np.concatenate([(b - a) / 2 * ws for a, b in panels])
-            half = np.minimum(1.0, 2 * (1 - np.abs(y)))
+        y, rows, half = opening_chords(shape, count + 4, 2 * count + 16)
         degrees = np.arange(count)
         ends = np.polynomial.legendre.legvander(half, count)
         chords = np.zeros((len(y), count))

@@ -15,7 +15,7 @@ import numpy as np
 
 from plenocli.base.linear_maps import torus_for
 from plenocli.forward.camera.model import ROW_SPACING
-from plenocli.forward.camera.quadrature import gauss, nodes_for
+from plenocli.forward.camera.quadrature import gauss, nodes_for, opening_chords
 from plenocli.forward.volume.arriving import ArrivingField
 from plenocli.forward.volume.optics import VolumeOptics
 from plenocli.forward.volume.waves import near
@@ -58,7 +58,12 @@ class Grating:
         down, right = self.orders(0), self.orders(1)
         slope = float(max(np.abs(down).max(), np.abs(right).max()))
         slope += o.k * o.open_width / o.focal_length
-        rows, weights, ends = opening(o.opening, o.open_width / 2, slope)
+        half = o.open_width / 2
+        tip = half / ROW_SPACING if o.opening == "hexagon" else half
+        # along the rim of a circle both axes turn
+        along = nodes_for(slope * (tip / 2 if o.opening == "hexagon" else half))
+        rows, weights, ends = opening_chords(o.opening, along, along + 4)
+        rows, weights, ends = tip * rows, tip * weights, half * ends
         t, w = gauss(nodes_for(slope * ends.max()))
         columns = ends[:, None] * t
         to_rows = np.exp(-1j * down[:, None] * rows) * weights
@@ -199,24 +204,3 @@ class ShapedPlane:
         height, width = (n * size for n, size in zip(self._cells, self.optics.object_cell))
         # a point may be half a cell from the middle
         return ArrivingField(self.optics, self._depth, 0.6 * math.hypot(height, width))
-
-
-def opening(shape: str, half: float, slope: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Chords along x of a lenslet's opening: rows (m from its middle), weights, half lengths.
-
-    shape: "square", "circle" or "hexagon", with two flat sides facing +-x; half: its width, m.
-    slope: of the integrand's phase, up to so many rad/m.
-    """
-    if shape == "circle":
-        # equidistant angles converge spectrally, since the integrand is periodic in them
-        count = nodes_for(slope * half) + 4
-        angle = (np.arange(count) + 0.5) * np.pi / count - np.pi / 2
-        return half * np.sin(angle), np.pi / count * half * np.cos(angle), half * np.cos(angle)
-    if shape == "square":
-        t, w = gauss(nodes_for(slope * half))
-        return half * t, half * w, np.full(len(t), half)
-    tip = half / ROW_SPACING
-    t, w = gauss(nodes_for(slope * tip / 2))
-    height = np.concatenate([(t - 3) / 4, t / 2, (t + 3) / 4])
-    weight = np.concatenate([w / 4, w / 2, w / 4])
-    return tip * height, tip * weight, half * np.minimum(1.0, 2 * (1 - np.abs(height)))

@@ -11,7 +11,6 @@ import numpy as np
 from plenocli.base.errors import InputError
 from plenocli.base.text import by
 from plenocli.base.tiling import in_cells, in_lenslets
-from plenocli.forward.camera.model import ROW_SPACING
 from plenocli.forward.sensor.capture import SuperpixelGrid
 from plenocli.forward.sensor.frames import saturated
 from plenocli.forward.sensor.superpixel import extract
@@ -124,8 +123,11 @@ def _step(calibration: Calibration, shape: tuple[int, int], lattice: str) -> tup
             "calibration",
             "turn white image and captures so that rows of lenslets follow those of pixels",
         )
-    high = ROW_SPACING if lattice == "hexagonal" else 1.0
-    return float(grid.pitch[0]) * high / shape[0], float(grid.pitch[1]) / shape[1]
+    down, right = (float(p) for p in grid.pitch)
+    if lattice == "hexagonal":
+        # rows stand as far apart as the lattice has them, evenly or not
+        down = abs(float(np.linalg.det(grid.basis))) / right
+    return down / shape[0], right / shape[1]
 
 
 def _tiled(capture: Capture, shape: tuple[int, int], lattice: str) -> Measurement:
@@ -198,9 +200,19 @@ def _resampled(
     usable = np.isfinite(raw) & np.isfinite(seen) & lit[..., None]
     noise = pixel_noise(capture, calibration, raw, seen, usable)
     good = np.isfinite(cut) & lit[..., None]
+    signal = np.where(good, cut, 0.0) / even / usual
+    if lattice == "hexagonal" and _starts_aside(grid.centres):
+        signal, good = (np.pad(a, ((1, 0), (0, 0), (0, 0))) for a in (signal, good))
     return Measurement(
-        signal=np.where(good, cut, 0.0) / even / usual,
+        signal=signal,
         read_variance=noise.without_signal / usual**2,
         gain=noise.gain / usual,
         usable=good,
     )
+
+
+def _starts_aside(centres: np.ndarray) -> bool:
+    """Whether the first row of a hexagonal lattice is the lower one of its cell, half a pitch to
+    the right; centres (lenslet_row, lenslet_column, 2).
+    """
+    return len(centres) > 1 and bool(np.nanmedian(centres[1, :, 1] - centres[0, :, 1]) < 0)

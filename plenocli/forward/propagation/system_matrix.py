@@ -210,7 +210,8 @@ class PifBuilder:
 
         size: about how many columns at a time at most (default: a quarter GiB of them).
 
-        Yields (flat indices of points, A of these as from `columns`). Raises as `columns`.
+        Yields (flat indices of points, in no order; A of these as from `columns`). Raises as
+        `columns`.
         """
         size = size or max(8, BLOCK_BYTES // (self.shape[0] * self.shape[1] * self.dtype.itemsize))
         seeds = self._seeds()
@@ -234,6 +235,12 @@ class PifBuilder:
     def turns(self) -> bool:
         """Whether rows and columns of the points may be exchanged."""
         return self.symmetry[2] and self.symmetry[0] == self.symmetry[1]
+
+    def whole(self) -> np.ndarray:
+        """A at this wavelength, (superpixel, pixel, point). Raises as `columns`."""
+        A = np.empty((*self.shape, self.points), self.dtype)
+        self.fill(A)
+        return A
 
     def fill(
         self,

@@ -199,8 +199,7 @@ def _predicted(camera: Camera, calibration: Calibration) -> tuple[np.ndarray, np
         sampled = _in_thirds(finely_sampled(seen, wavelength))
         builder = pif_builder(sampled, wavelength, superpixels=(REACH, REACH), accuracy=KNOWN_TO)
         offsets = builder.offsets
-        matrix = np.concatenate([block for _, block in builder.blocks()], axis=2)
-        bands.append(_thirds(matrix, sampled))
+        bands.append(_thirds(builder.whole(), sampled))
     light = np.stack(bands, axis=-1) * _colours(camera, calibration)[:, None]
     known = np.where(np.isfinite(measured), light.sum(axis=(0, 2)), 0).sum(axis=0)
     return offsets, light * (np.nansum(measured, axis=0) / np.maximum(known, 1e-300))

@@ -200,7 +200,7 @@ class Ascent:
             curvature = slopes.curvature(at, at.factor)
             best, damping = self._step(at, curvature, slopes.rise, damping)
             if at.factor > MISFIT and step % 3 == 2:
-                best = max([best, *self._mirrored(best)], key=lambda p: p.height)
+                best = max([best, *self.mirrored(best)], key=lambda p: p.height)
             gain = best.height - at.height
             promised = 0.5 * float(slopes.rise @ np.linalg.solve(curvature, slopes.rise))
             if best is not at:
@@ -245,9 +245,11 @@ class Ascent:
                 break
         return best
 
-    def _mirrored(self, at: Point) -> list[Point]:
+    def mirrored(self, at: Point, finer: np.ndarray | None = None) -> list[Point]:
         """Cameras with defocus and aberrations mirrored, but not the lenslets' curvature, which
         captures tell weakly so that it stays behind on the wrong side: as it is, and as described.
+
+        finer: as in Point, None for that of `at`, turned.
         """
         mirrored = self.family.mirrored(self.values(at.x))
         if mirrored is None:
@@ -257,8 +259,8 @@ class Ascent:
         for kept in (at.x[place], 0.0):
             x = (mirrored - self.family.start) / self.family.tolerance
             x[place] = kept
-            finer = None if at.finer is None else at.finer[:, ::-1]
-            found.append(self.point(x, at.factor, finer=finer))
+            turned = None if at.finer is None else at.finer[:, ::-1]
+            found.append(self.point(x, at.factor, finer=turned if finer is None else finer))
         return found
 
 

@@ -41,9 +41,10 @@ MENDED, ALIKE = 3, 0.03
 """How often, at the most, pixels that count for nothing are filled in anew under the camera that
 was found, and by how much of the noise, root mean square, that must change the captures.
 """
-SLACK, DEVIATIONS = 0.01, 3.0
-"""Noise over the noise told, less one, up to which a fit explains its captures: photographs are
-not quite what the prior says, and the noise of few pixels is known so well only.
+CERTAIN, SLACK, DEVIATIONS = 0.005, 0.01, 3.0
+"""Noise over the noise told, less one, up to which a fit explains its captures, on the face of it
+and at the most: photographs are not quite what the prior says, and the noise of few pixels is known
+so well only.
 """
 UNRESOLVED = 4e-4
 """What objects finer than the points of a lenslet may leave over, of a capture's root mean square.
@@ -123,12 +124,14 @@ def fit_camera(
     first = ascent.settle(ascent.climb(begun, TRIAL, LOUD * problem.evidence.quiet), STEPS)
     if not _whole(problem, known) or first.evidence.noise_factor() > limits[0]:
         first, ascent, problem = mend(first, ascent, problem)
+    first = _mirrored_along_one_axis(ascent, first, limits[0])
     best = _highest(ascent, first, limits[0])
-    if best is not first and not _whole(problem, known):
-        best, ascent, problem = mend(best, ascent, problem)
+    if best is not first:
+        best = _mirrored_along_one_axis(ascent, best, limits[0])
+        if not _whole(problem, known):
+            best, ascent, problem = mend(best, ascent, problem)
     turned = None
     if best.evidence.noise_factor() <= limits[1]:
-        best = _mirrored_along_one_axis(ascent, best)
         best, turned = _told_apart(ascent, best, problem.captures)
     # what is left over beyond the noise is believed of fine objects only where pictures go on
     sure = turned is not None and turned >= CLEAR
@@ -183,7 +186,7 @@ def accepted_ratios(values: int, quiet: float) -> tuple[float, float]:
     quiet: root mean square of the captures over their noise.
     """
     sure = DEVIATIONS / float(np.sqrt(2 * values))
-    return 1 + SLACK + sure, float(np.hypot(1 + SLACK, UNRESOLVED * quiet)) + sure
+    return 1 + CERTAIN + sure, float(np.hypot(1 + SLACK, UNRESOLVED * quiet)) + sure
 
 
 def _highest(ascent: Ascent, first: Point, limit: float) -> Point:
@@ -207,15 +210,15 @@ def _highest(ascent: Ascent, first: Point, limit: float) -> Point:
     return max([first, other], key=_likely)
 
 
-def _mirrored_along_one_axis(ascent: Ascent, at: Point) -> Point:
+def _mirrored_along_one_axis(ascent: Ascent, at: Point, limit: float) -> Point:
     """Where the way leads from a camera whose defocus and astigmatism have changed places, if it is
     more likely than the one that was found: both blur alike, and where noise hides the difference
-    either is a maximum of the evidence.
+    either is a maximum of the evidence, which a fit beyond `limit` may have ended on.
     """
     family = ascent.family
     for values in family.half_mirrored(ascent.values(at.x)):
         other = ascent.point((values - family.start) / family.tolerance, finer=at.finer)
-        if _likely(other) > _likely(at) - ALMOST:
+        if at.evidence.noise_factor() > limit or _likely(other) > _likely(at) - ALMOST:
             at = max([at, ascent.climb(other, STEPS)], key=_likely)
     return at
 
@@ -241,7 +244,8 @@ def _told_apart(
         return at, None
     if steps[0] <= steps[1]:
         return at, steps[1] / steps[0]
-    return ascent.climb(other, STEPS), steps[0] / steps[1]
+    other = max([other, *ascent.mirrored(at, other.finer)], key=_likely)
+    return ascent.settle(other, STEPS), steps[0] / steps[1]
 
 
 def _border_steps(at: Point, ascent: Ascent, captures: Sequence[CapturedLenslets]) -> float | None:

@@ -9,6 +9,7 @@ distance from LMMSE's (docs/model.md, "Spatial reconstruction").
 from __future__ import annotations
 
 from functools import lru_cache
+from statistics import NormalDist
 
 import numpy as np
 
@@ -165,12 +166,11 @@ def about(distance: np.ndarray, sigma: np.ndarray) -> np.ndarray:
 @lru_cache(maxsize=1)
 def _radii() -> tuple[np.ndarray, np.ndarray]:
     """(distances, radii that hold INSIDE of a normal variable of deviation one about them)."""
-    from scipy.special import ndtr
-
+    normal = np.vectorize(NormalDist().cdf)
     apart = np.linspace(0, 4, 81)
     low, high = np.zeros(81), apart + 3
     for _ in range(50):
         middle = (low + high) / 2
-        short = ndtr(middle - apart) - ndtr(-middle - apart) < INSIDE
+        short = normal(middle - apart) - normal(-middle - apart) < INSIDE
         low, high = np.where(short, middle, low), np.where(short, high, middle)
     return apart, (low + high) / 2

@@ -94,16 +94,13 @@ def gathered(matrices: np.ndarray, weights: np.ndarray | None = None) -> np.ndar
     """
     if weights is None:
         weights = np.full((1, len(matrices)), 1 / len(matrices))
-    return np.concatenate(
-        [
-            sum(
-                (w * np.asarray(a, np.float64) for w, a in zip(row, matrices) if w),
-                np.zeros(matrices.shape[1:]),
-            )
-            for row in weights
-        ],
-        axis=2,
-    )
+    bands = []
+    for row in weights:
+        bands.append(np.zeros(matrices.shape[1:]))
+        for w, a in zip(row, matrices):
+            if w:
+                bands[-1] += w * np.asarray(a, np.float64)
+    return np.concatenate(bands, axis=2) if len(bands) > 1 else bands[0]
 
 
 Shared = Literal[

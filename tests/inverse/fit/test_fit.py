@@ -182,9 +182,9 @@ def test_captures_without_light_or_noise_are_refused(capture):
 
 def test_few_pixels_and_quiet_captures_may_look_noisier():
     near, far = accepted_ratios(100, 1.0)
-    assert near == pytest.approx(far, rel=1e-6) and near > 1.2
+    assert 1.2 < near < far < near + 0.01
     near, far = accepted_ratios(10**6, 1000.0)
-    assert 1.01 < near < 1.02 < far < 1.15
+    assert 1.005 < near < 1.01 < 1.02 < far < 1.15
 
 
 def test_a_grid_that_is_turned_is_said():

@@ -62,6 +62,8 @@ ROOM = 0.25
 """Directions that the matrix does not reach, over those that stand above the noise, from which on
 nothing found there tells something.
 """
+ROUNDED = 1e-5
+"""Noise over brightness from which on photographs are captured in single precision."""
 ROUNDS = 2
 LEAST_FACTOR = 1e-3
 
@@ -233,7 +235,10 @@ class _Judge:
         grey = pieces(pictures, system.object_shape, contrast, bright, rng)
         if grey is None:
             return None
-        clear = np.tile(grey, max(1, len(system.bands))) @ system.own.T
+        # in half the time where noise hides what single precision rounds off
+        kind = np.float32 if lmmse.sigma > ROUNDED * bright else np.float64
+        objects = np.tile(grey, max(1, len(system.bands))).astype(kind)
+        clear = np.asarray(objects @ system.own.T.astype(kind), float)
         return cls(
             y=y,
             clear=clear,
@@ -257,8 +262,9 @@ class _Judge:
 
     def of_lmmse(self, lmmse: Lmmse) -> _Verdict:
         """Noise of the photographs is that of a pixel, and in the coordinates what is believed."""
-        coordinates = lmmse.analysis.T * (np.sqrt(lmmse.noise) - lmmse.sigma)
-        noise = lmmse.sigma * self.noise + (self.noise @ lmmse.analysis.T) @ coordinates.T
+        more, noise = np.sqrt(lmmse.noise) - lmmse.sigma, lmmse.sigma * self.noise
+        if more.any():
+            noise = noise + (self.noise @ lmmse.analysis.T) @ (lmmse.analysis.T * more).T
         return _Verdict(
             found=detail_jumps(lmmse, self.y, self.shape),
             right=detail_jumps(lmmse, self.clear + noise, self.shape),

@@ -18,7 +18,7 @@ from plenocli.inverse.picture.trust.rough_scene import reached
 
 MOTIONS = 10
 """How many ways light is looked for to have moved in."""
-LOOKED_AT = 256
+LOOKED_AT = 64
 """Lenslets that are looked at, spread over all, at most."""
 ALIKE, IN_STEP = 0.99, 0.04
 """Squared mean of the lenslets' brightness over its mean square from which on what goes with it is
@@ -28,12 +28,17 @@ from which on that may be a scene in step with the lenslets (0.04 and more).
 
 FEW = 5
 """Bright lenslets that are too few for their scatter to tell chance."""
+STRONG = 1e-4
+"""Singular value over the largest below which what moves is not looked at."""
 LOUD = 0.1
 """Power over the noise from which on a coordinate is looked at, in the lenslet of most contrast."""
 UNUSUAL = 0.015
 """Information that one lenslet has about what moved, by which photographs seem to move under the
 right matrix, as they are not quite what their statistics say.
 """
+
+Factors = tuple[np.ndarray, np.ndarray]
+"""(pixel, k) and (k, point)."""
 
 
 def moved_light(
@@ -51,21 +56,23 @@ def moved_light(
     if min(*system.pixel_shape, *system.object_shape) < 2:
         return 0.0
     y = y[:, :: -(-y.shape[1] // LOOKED_AT)]
-    slopes, chance = _beyond(system, svd, lmmse, y, sigma)
-    more, unusual = _within(system, lmmse, y)
+    strong = svd.rank(STRONG)
+    own = svd.u[:, :strong] * svd.s[:strong], svd.vt[:strong]
+    slopes, chance = _beyond(system, own, svd, lmmse, y, sigma)
+    more, unusual = _within(system, lmmse, y, own)
     return max(_deviations(slopes, chance), _deviations(slopes + more, chance + unusual))
 
 
 def _beyond(
-    system: LensletMatrix, svd: Svd, lmmse: Lmmse, y: np.ndarray, sigma: float
+    system: LensletMatrix, own: Factors, svd: Svd, lmmse: Lmmse, y: np.ndarray, sigma: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Slopes (motion,) of the likelihood of what no object gives, and their covariance."""
     # a star has far more light than brightness and pixels tell
-    energy = np.sum(lmmse.adaptive(y)[0] ** 2, axis=0)
+    energy = np.sum(lmmse.apply(y, lmmse.scales(y)) ** 2, axis=0)
     basis = reached(svd, float(energy.mean()), sigma)
     seen = basis @ (basis.T @ y)
     rest = (y - seen).ravel() / sigma
-    moved = motions(system, lmmse.adaptive(seen)[0]) / sigma
+    moved = motions(system, lmmse.apply(seen, lmmse.scales(seen)), own) / sigma
     moved -= basis @ np.einsum("pk,mpl->mkl", basis, moved, optimize=True)
     moved = moved.reshape(len(moved), -1)
     slopes, weighted = moved @ rest, moved * rest
@@ -73,7 +80,9 @@ def _beyond(
     return slopes, min(chances, key=lambda chance: _deviations(slopes, chance))
 
 
-def _within(system: LensletMatrix, lmmse: Lmmse, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _within(
+    system: LensletMatrix, lmmse: Lmmse, y: np.ndarray, own: Factors | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Slopes (motion,) of the likelihood of photographs behind what objects give, and their
     covariance, by chance and as photographs are not quite what their statistics say.
 
@@ -87,7 +96,7 @@ def _within(system: LensletMatrix, lmmse: Lmmse, y: np.ndarray) -> tuple[np.ndar
     if not loud.any():
         return np.zeros(MOTIONS), np.zeros((MOTIONS, MOTIONS))
     power, noise = lmmse.power[loud], lmmse.noise[loud]
-    moves = lmmse.analysis[loud] @ motions(system, lmmse.gain[:, loud])
+    moves = lmmse.analysis[loud] @ motions(system, lmmse.gain[:, loud], own)
     moves *= 1 - np.eye(len(power))
     w, variance = lmmse.coordinates(y)[loud], scales * power[:, None] + noise[:, None]
     pull = w / variance
@@ -138,11 +147,13 @@ def moved_even_light(
     return lmmse.analysis.T @ (moved * deviation), _as_rare(squares, len(made))
 
 
-def motions(system: LensletMatrix, x: np.ndarray) -> np.ndarray:
+def motions(system: LensletMatrix, x: np.ndarray, own: Factors | None = None) -> np.ndarray:
     """(motion, pixel, signal): how superpixels of objects x (point, signal) change with the sensor
     shifted along rows and columns, magnified and turned about its middle, with the object out of
     focus, evenly and with two astigmatisms, with a pitch that is off and with two comas; in any
     units.
+
+    own: of whose product the own block is taken to be.
     """
     rows, columns = system.pixel_shape
     g, h = (_places(n) for n in (rows, columns))
@@ -152,7 +163,8 @@ def motions(system: LensletMatrix, x: np.ndarray) -> np.ndarray:
 
     def shown(objects: np.ndarray) -> np.ndarray:
         flat = objects.reshape(-1, objects.shape[-1])
-        return (system.own @ flat).reshape(rows, columns, -1)
+        seen = system.own @ flat if own is None else own[0] @ (own[1] @ flat)
+        return seen.reshape(rows, columns, -1)
 
     down, right = np.gradient(shown(x), axis=(0, 1))
     lower, righter = (shown(part) for part in np.gradient(x, axis=(1, 2)))

@@ -55,9 +55,9 @@ class CommandSeconds:
     def line(self) -> str:
         """One line for people."""
         return (
-            f"time: about {_duration(self.together)} on one core: {_duration(self.matrix)} the "
-            f"matrix, {_duration(self.diagnosis)} rank and condition, "
-            f"{_duration(self.writing + self.start)} to start and to write"
+            f"time: about {duration(self.together)} on one core: {duration(self.matrix)} the "
+            f"matrix, {duration(self.diagnosis)} rank and condition, "
+            f"{duration(self.writing + self.start)} to start and to write"
         )
 
 
@@ -146,13 +146,13 @@ def planes_table(planes: list[PlaneCost]) -> list[str]:
     """Planes as lines of text, of many the first and the last ones, and their sum."""
     lines = [
         f"{p.distance:10.4g} m  {p.superpixels[0]}x{p.superpixels[1]} superpixels  "
-        f"{_duration(p.seconds)}  {_size(p.bytes)}"
+        f"{duration(p.seconds)}  {_size(p.bytes)}"
         for p in planes
     ]
     if len(lines) > 2 * ENDS + 1:
         lines[ENDS:-ENDS] = ["       ..."]
     seconds, size = sum(p.seconds for p in planes), sum(p.bytes for p in planes)
-    return [*lines, f"in all {_duration(seconds)}, {_size(size)}"]
+    return [*lines, f"in all {duration(seconds)}, {_size(size)}"]
 
 
 def considered(plan: PifPlan) -> list[dict[str, Any]]:
@@ -189,7 +189,7 @@ def expectation(
     if times * chosen.seconds() + beside < LONG:
         return None
     text = (
-        f"about {_duration(times * seconds_here(chosen) + beside)} on one core"
+        f"about {duration(times * seconds_here(chosen) + beside)} on one core"
         + ("" if memory is None else f" and {_size(memory)} of memory")
         + f" ({chosen.name}, error {chosen.error:.1g})"
     )
@@ -205,7 +205,7 @@ def expectation(
         return text
     other = min(quicker, key=lambda c: (c.error, c.seconds()))
     return (
-        f"{text}; --model {other.model} takes {_duration(times * seconds_here(other) + beside)} at "
+        f"{text}; --model {other.model} takes {duration(times * seconds_here(other) + beside)} at "
         f"an error of {other.error:.1g}"
     )
 
@@ -215,7 +215,7 @@ def _table(rows: Sequence[Candidate]) -> list[str]:
     for c in rows:
         numbers = ("-", "-", "-")
         if c.split is not None:
-            numbers = (f"{c.error:.1g}", _duration(seconds_here(c)), _size(c.bytes))
+            numbers = (f"{c.error:.1g}", duration(seconds_here(c)), _size(c.bytes))
         cells.append((c.name, *numbers, "chosen" if c.why is None else c.why))
     widths = [max(len(row[i]) for row in cells) for i in range(4)]
     return [
@@ -226,7 +226,7 @@ def _table(rows: Sequence[Candidate]) -> list[str]:
     ]
 
 
-def _duration(seconds: float) -> str:
+def duration(seconds: float) -> str:
     """Seconds in a unit that a person would take."""
     units = (("s", 1, 100), ("min", 60, 100), ("h", 3600, 72), ("days", 86400, math.inf))
     unit, size, _ = next(known for known in units if seconds < (known[2] - 0.5) * known[1])

@@ -6,18 +6,22 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from plenocli.base.errors import ConfigError
-from plenocli.forward.camera.geometry import finely_sampled
+from plenocli.base.progress import note
+from plenocli.forward.camera.geometry import finely_sampled, geometry
 from plenocli.forward.camera.pupil import polarised
 from plenocli.forward.propagation.response import uniform_response, valid_for
 from plenocli.inverse.registration.smooth_response import DEGREE
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from plenocli.forward.camera.model import Camera
+    from plenocli.forward.propagation.plan import PifPlan
     from plenocli.inverse.calibration.calibration import Calibration
 
 POINTS = 3
@@ -129,8 +133,15 @@ def neighbour_light(camera: Camera, calibration: Calibration) -> NeighbourLight:
 
     Raises ConfigError where there is no prediction for these lenslets, or it is none of them.
     """
+    from plenocli.forward.accuracy.dial import seconds_here
+    from plenocli.forward.accuracy.explain import LONG, duration
+
     _check(camera, calibration)
     measured, camera = _typical(calibration), _as_measured(camera, calibration)
+    plans = [plan.chosen for *_, plan in _planned(camera, calibration)]
+    if 3 * sum(plan.seconds() for plan in plans) > LONG:
+        seconds = 3 * sum(map(seconds_here, plans))
+        note(f"neighbours' light is predicted first, in about {duration(seconds)} on one core")
     offsets, light = _predicted(camera, calibration)
     total = light.sum(axis=(0, 2))
     apart = np.linalg.norm(np.nan_to_num(measured - total)) / np.linalg.norm(
@@ -191,18 +202,29 @@ def _predicted(camera: Camera, calibration: Calibration) -> tuple[np.ndarray, np
     band as the calibrated response: by as many object points as a field has diffraction cells,
     since fewer leave fringes, and too little light on neighbours.
     """
-    from plenocli.forward.accuracy.dial import pif_builder
+    from plenocli.forward.propagation.system_matrix import PifBuilder
 
     measured, bands = _typical(calibration), []
     offsets = np.zeros((0, 2), int)
-    for wavelength, seen in _by_band(camera, calibration):
-        sampled = _in_thirds(finely_sampled(seen, wavelength))
-        builder = pif_builder(sampled, wavelength, superpixels=(REACH, REACH), accuracy=KNOWN_TO)
+    for wavelength, sampled, plan in _planned(camera, calibration):
+        builder = PifBuilder(sampled, wavelength, plan)
         offsets = builder.offsets
         bands.append(_thirds(builder.whole(), sampled))
     light = np.stack(bands, axis=-1) * _colours(camera, calibration)[:, None]
     known = np.where(np.isfinite(measured), light.sum(axis=(0, 2)), 0).sum(axis=0)
     return offsets, light * (np.nansum(measured, axis=0) / np.maximum(known, 1e-300))
+
+
+def _planned(camera: Camera, calibration: Calibration) -> Iterator[tuple[float, Camera, PifPlan]]:
+    """The wavelength (m) of each band, the camera with its object points, and how to compute their
+    columns.
+    """
+    from plenocli.forward.accuracy.dial import plan_pif
+
+    for wavelength, seen in _by_band(camera, calibration):
+        sampled = _in_thirds(finely_sampled(seen, wavelength))
+        request: Any = {"superpixels": (REACH, REACH), "accuracy": KNOWN_TO}
+        yield wavelength, sampled, plan_pif(sampled, wavelengths=(wavelength,), **request)
 
 
 def _by_band(camera: Camera, calibration: Calibration) -> list[tuple[float, Camera]]:
@@ -306,6 +328,8 @@ def _check(camera: Camera, calibration: Calibration) -> None:
     from plenocli.inverse.calibration.calibration import there
 
     windows, grid = there(calibration.windows), calibration.grid
+    optics = [geometry(camera, w) for w in there(calibration.response).wavelengths]
+    spread = max(1 + one.blur / one.D2 for one in optics)
     why = None
     if grid.lattice != "square" or camera.lenslet_array.lattice != "square":
         why = "lenslets on a hexagonal lattice"
@@ -319,6 +343,11 @@ def _check(camera: Camera, calibration: Calibration) -> None:
         why = f"the colour filter array {camera.sensor.cfa}, calibrated: {calibration.sensor.cfa}"
     elif calibration.sensor.cfa != "mono" and np.ptp(windows.origin[grid.valid] % 2, axis=0).any():
         why = "windows that start on different colours of the filter array"
+    elif spread > REACH:
+        why = (
+            f"a main lens so far out of focus that an object point's light meets {spread:.0f} "
+            f"lenslets in a row, of which {REACH} are followed"
+        )
     if why is not None:
         raise ConfigError(
             f"neighbours' light is not predicted for {why}", "camera", "demultiplex without it"

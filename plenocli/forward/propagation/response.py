@@ -298,32 +298,22 @@ def _through_spot(
     edges: for both axes a list of pixel edges (2, pixel);
     which: for both axes the number of each lenslet in it.
     """
-    minify = geometry.z3 / geometry.z2
+    minify, pitch = geometry.z3 / geometry.z2, geometry.superpixel_pitch
+
+    def between(t: np.ndarray, far: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+        ends = (_summed(spot.second, t, far * pitch, minify * end) for end in (high, low))
+        return np.subtract(*ends) / minify
+
     out = np.zeros((len(which[0]), *(line[0].shape[1] for line in edges)))
     for rows, columns in geometry.neighbourhood(reach):
         for weight, top, bottom, left, right in strips:
-            if bottom is None:
-                down = [
-                    _summed(spot.first, t, rows * geometry.superpixel_pitch, minify * top)
-                    for t in edges[0]
-                ]
-            else:
-                down = [
-                    (
-                        _summed(spot.second, t, rows * geometry.superpixel_pitch, minify * bottom)
-                        - _summed(spot.second, t, rows * geometry.superpixel_pitch, minify * top)
-                    )
-                    / minify
-                    for t in edges[0]
-                ]
-            across = [
-                (
-                    _summed(spot.second, t, columns * geometry.superpixel_pitch, minify * right)
-                    - _summed(spot.second, t, columns * geometry.superpixel_pitch, minify * left)
-                )
-                / minify
-                for t in edges[1]
+            down = [
+                _summed(spot.first, t, rows * pitch, minify * top)
+                if bottom is None
+                else between(t, rows, top, bottom)
+                for t in edges[0]
             ]
+            across = [between(t, columns, left, right) for t in edges[1]]
             for n, (i, j) in enumerate(zip(*which)):
                 out[n] += (weight[:, None] * down[i]).T @ across[j]
     return out * geometry.lenslet_width**2

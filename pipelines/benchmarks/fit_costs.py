@@ -166,7 +166,11 @@ def expected(case: Case, counts: Mapping[str, float]) -> tuple[float, ...]:
         phase = view.k * view.D1 / 2 * plan.bands[0].half / view.z2
         return (SpreadLaw(**counts).terms(phase, plan.bands[0].spread_cut),)
     assert isinstance(plan.bands[0], ExactBand)
-    return cost_law.expected_counts(camera, view, plan.bands[0], plan.shape, TermLaw(**counts))
+    # most terms, and most pairs of terms that they are compressed from, of any superpixel
+    window = cost_law.superpixels_of(plan.shape[1])
+    sizes = cost_law._sizes(camera, view, plan.bands[0], window, TermLaw(**counts))
+    aside = [kind.aside for kind in sizes.kinds]
+    return max(sizes.ranks[n] for n in aside), max(sizes.products[n] for n in aside)
 
 
 def measure(case: Case) -> Measured | None:

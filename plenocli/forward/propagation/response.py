@@ -91,10 +91,8 @@ def uniform_response(
     separable = geometry.lenslet_shape == "square" and (
         model == "fresnel" or lens.aperture_shape == "square"
     )
-    reach, scale = (
-        _reach(geometry, model),
-        1 / (aperture_area(lens) * geometry.row_spacing * geometry.D2**2),
-    )
+    reach = _reach(geometry, model)
+    scale = 1 / (aperture_area(lens) * geometry.row_spacing * geometry.D2**2)
     # lenslets of one row are often shifted alike
     lines, which = zip(*(np.unique(shifts[:, axis], return_inverse=True) for axis in (0, 1)))
     edges = [
@@ -172,9 +170,8 @@ def _reach(geometry: Geometry, model: str) -> int:
         geometry.lenslet_extent
     )
     windows = max(n * geometry.pixel_pitch / 2 + geometry.pixel_pitch for n in geometry.pixel_shape)
-    far = math.ceil(
-        (image + windows) / (geometry.superpixel_pitch * geometry.row_spacing) - 1e-9
-    ) - (model == "ray")
+    pitch = geometry.superpixel_pitch * geometry.row_spacing
+    far = math.ceil((image + windows) / pitch - 1e-9) - (model == "ray")
     return far + (TAIL if model == "fresnel" else 0)
 
 
@@ -222,12 +219,8 @@ class WaveSpot:
         v = (t + 1) / 2 * width
         f = v / (geometry.wavelength * geometry.z3)
         # both signs of f
-        otf = (
-            (1 - v / width)
-            * np.sinc(geometry.kappa * v * (width - v) / geometry.wavelength)
-            * w
-            / cell
-        )
+        sinc = np.sinc(geometry.kappa * v * (width - v) / geometry.wavelength)
+        otf = (1 - v / width) * sinc * w / cell
         even = np.empty(len(s))
         for start in range(0, len(s), 4096):
             part = slice(start, start + 4096)
@@ -361,8 +354,8 @@ def _through_opening(
 
 
 def _lit(ends: np.ndarray, low: float, high: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Where pixels (2, lenslet, pixel) of lenslets' images of the pupil meet a filter from low to
-    high (m): (pixel, place), 1 where a place is of a pixel, and both ends of places.
+    """(pixel, place), 1 where a place is of a pixel, and both ends of places where pixels (2,
+    lenslet, pixel) of images of the pupil meet a filter from low to high, m.
     """
     upper, lower = np.clip(ends, low, high)
     hit = np.nonzero(upper > lower)

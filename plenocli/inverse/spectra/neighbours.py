@@ -138,15 +138,13 @@ def neighbour_light(camera: Camera, calibration: Calibration) -> NeighbourLight:
 
     _check(camera, calibration)
     measured, camera = _typical(calibration), _as_measured(camera, calibration)
-    plans = [plan.chosen for *_, plan in _planned(camera, calibration)]
-    if 3 * sum(plan.seconds() for plan in plans) > LONG:
-        seconds = 3 * sum(map(seconds_here, plans))
+    seconds = 3 * sum(seconds_here(plan.chosen) for *_, plan in _planned(camera, calibration))
+    if seconds > LONG:
         note(f"neighbours' light is predicted first, in about {duration(seconds)} on one core")
     offsets, light = _predicted(camera, calibration)
     total = light.sum(axis=(0, 2))
-    apart = np.linalg.norm(np.nan_to_num(measured - total)) / np.linalg.norm(
-        np.nan_to_num(measured)
-    )
+    measured, apart = np.nan_to_num(measured), np.nan_to_num(measured - total)
+    apart = np.linalg.norm(apart) / np.linalg.norm(measured)
     if not apart < UNLIKE:
         raise ConfigError(
             f"the described camera's response differs by {apart:.0%} from the calibrated one",
@@ -223,8 +221,8 @@ def _planned(camera: Camera, calibration: Calibration) -> Iterator[tuple[float, 
 
     for wavelength, seen in _by_band(camera, calibration):
         sampled = _in_thirds(finely_sampled(seen, wavelength))
-        request: Any = {"superpixels": (REACH, REACH), "accuracy": KNOWN_TO}
-        yield wavelength, sampled, plan_pif(sampled, wavelengths=(wavelength,), **request)
+        settings: Any = {"superpixels": (REACH, REACH), "accuracy": KNOWN_TO}
+        yield wavelength, sampled, plan_pif(sampled, wavelengths=(wavelength,), **settings)
 
 
 def _by_band(camera: Camera, calibration: Calibration) -> list[tuple[float, Camera]]:

@@ -206,6 +206,9 @@ def test_what_cannot_be_predicted_is_said(bench, capsys):
     turned = camera.replace(**{"filter_array.filters": camera.filter_array.filters[::-1]})
     with pytest.raises(ConfigError, match="differs by"):
         neighbour_light(turned, calibration)
+    near = camera.replace(**{"object.distance": 1.5 * camera.main_lens.focal_length})
+    with pytest.raises(ConfigError, match="lenslets in a row, of which 5 are followed"):
+        neighbour_light(near, calibration)
 
 
 def test_without_noise_figures_pixels_are_not_weighed(bench, checkerboard):

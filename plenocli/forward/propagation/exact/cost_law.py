@@ -152,19 +152,6 @@ def features(
     )
 
 
-def expected_counts(
-    camera: Camera,
-    geometry: Geometry,
-    band: ExactBand,
-    shape: tuple[int, ...],
-    numbers: TermLaw | None = None,
-) -> tuple[float, float]:
-    """Most terms, and most pairs of terms that they are compressed from, of any superpixel."""
-    sizes = _sizes(camera, geometry, band, superpixels_of(shape[1]), numbers or term_law())
-    aside = [kind.aside for kind in sizes.kinds]
-    return max(sizes.ranks[n] for n in aside), max(sizes.products[n] for n in aside)
-
-
 def _parabolic(camera: Camera) -> bool:
     return camera.lenslet_array.profile == "parabolic"
 

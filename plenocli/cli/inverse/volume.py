@@ -68,6 +68,12 @@ class _Background(click.ParamType):
     ),
 )
 @click.option(
+    "--channel",
+    type=click.Choice(["R", "G", "B"]),
+    default=None,
+    help="Pixels of a colour sensor that are taken; each colour makes a volume of its own.",
+)
+@click.option(
     "--device",
     type=click.Choice(["cpu", "cuda"]),
     default="cpu",
@@ -90,6 +96,7 @@ def command(
     hold_out: float,
     background: float | Literal["auto"],
     most_planes: int | None,
+    channel: str | None,
     device: str,
     output: Path,
     seed: int,
@@ -117,6 +124,7 @@ def command(
         hold_out=hold_out,
         background=background,
         most_planes=most_planes,
+        channel=channel,
         device=device,
         overwrite=overwrite,
         seed=seed,

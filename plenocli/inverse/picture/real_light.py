@@ -261,14 +261,19 @@ def pixel_noise(
     sensor = calibration.sensor
     if sensor.gain is not None:
         return Noise(gain=sensor.gain, read_variance=sensor.read_variance)
-    found = transfer_noise(cut, white, usable, there(calibration.windows).shape)
+    apart = 1 if capture.cfa == "mono" else 2
+    found = transfer_noise(cut, white, usable, there(calibration.windows).shape, apart)
     # a sensor without noise is none
     least = max(sensor.read_variance, (1e-6 * float(np.nanmax(np.abs(white)))) ** 2)
     return Noise(gain=found, read_variance=least)
 
 
 def transfer_noise(
-    cut: np.ndarray, white: np.ndarray, usable: np.ndarray, shape: tuple[int, int]
+    cut: np.ndarray,
+    white: np.ndarray,
+    usable: np.ndarray,
+    shape: tuple[int, int],
+    apart: int = 1,
 ) -> float:
     """Photon transfer of one capture: the variance of mixed second differences of pixels, which
     what lenslets show has little of, against their level.
@@ -276,14 +281,16 @@ def transfer_noise(
     cut, white: (lenslet_row, lenslet_column, pixel).
     usable: like cut.
     shape: (rows, columns) of a superpixel, px.
+    apart: pixels from one to the next of the same colour.
 
     Returns the variance for one unit of signal.
     """
     peak = np.nanmax(np.where(usable, white, 0.0), axis=2, keepdims=True)
     bright = np.where(usable & (white > BRIGHT * peak), cut, np.nan).reshape(-1, *shape)
-    second = bright[:, 2:] - 2 * bright[:, 1:-1] + bright[:, :-2]
-    mixed = (second[:, :, 2:] - 2 * second[:, :, 1:-1] + second[:, :, :-2]) / 6
-    level = bright[:, 1:-1, 1:-1]
+    both, n = 2 * apart, apart
+    second = bright[:, both:] - 2 * bright[:, n:-n] + bright[:, :-both]
+    mixed = (second[:, :, both:] - 2 * second[:, :, n:-n] + second[:, :, :-both]) / 6
+    level = bright[:, n:-n, n:-n]
     good = np.isfinite(mixed) & (level > 0)
     if np.count_nonzero(good) < 100:
         return 0.0

@@ -14,12 +14,16 @@ DARKEST = 0.05
 """Share of the lenslets that are taken for haze alone."""
 FEWEST = 4
 """Of them at least."""
+WHOLE = 0.8
+"""Of the most pixels that a lenslet has known, from which on it is known whole."""
 KEPT = 0.95
 """Of their light is taken for haze: they are dark by chance too."""
 TIE = 0.1
 """dB that held-out pixels must be predicted worse without haze for it to be left: iterations tell
 less of it than the linear estimate, which gains 1.2 where they gain nothing.
 """
+CHANCE = 2.0
+"""Standard errors by which it must be worse as well: a colour has but few pixels to tell by."""
 TRIED = 30
 """Iterations of Richardson-Lucy that show whether it is."""
 
@@ -30,31 +34,42 @@ def haze(measurement: Measurement) -> np.ndarray:
     """
     pixels = measurement.signal.shape[2]
     signal = measurement.signal.reshape(-1, pixels)
-    whole = signal
+    usable = np.ones(signal.shape, bool)
     if measurement.usable is not None:
         usable = measurement.usable.reshape(-1, pixels)
-        # pixels at the pupil's edge count behind no lenslet
-        whole = signal[usable[:, usable.any(axis=0)].all(axis=1)]
-    count = max(FEWEST, int(DARKEST * len(whole)))
-    if len(whole) < 4 * FEWEST:
+    known = usable.sum(axis=1)
+    # a colour's pixels are now a few more, now a few less of a superpixel's
+    whole = known >= WHOLE * known.max()
+    # pixels at the pupil's edge count behind no lenslet
+    signal = np.where(usable | ~usable.any(axis=0), signal, 0)[whole]
+    usable = (usable | ~usable.any(axis=0))[whole]
+    count = max(FEWEST, int(DARKEST * len(signal)))
+    if len(signal) < 4 * FEWEST:
         return np.zeros(pixels)
-    darkest = np.argsort(whole.sum(axis=1), kind="stable")[:count]
-    return KEPT * np.maximum(whole[darkest].mean(axis=0), 0)
+    usual = signal.sum(axis=0) / np.maximum(usable.sum(axis=0), 1)
+    level = signal.sum(axis=1) / np.maximum(usable @ usual, np.finfo(float).tiny)
+    darkest = np.argsort(level, kind="stable")[:count]
+    seen = usable[darkest].sum(axis=0)
+    mean = signal[darkest].sum(axis=0) / np.maximum(seen, 1)
+    return KEPT * np.maximum(np.where(seen > 0, mean, level[darkest].mean() * usual), 0)
 
 
 def without_haze(problem: Problem, known: np.ndarray) -> Problem:
     """The problem with the haze (pixel,) as its background, unless that predicts held-out pixels
-    worse by more than TIE: then as it is.
+    worse by more than TIE and chance: then as it is.
     """
     hazy = problem.with_measurement(replace(problem.measurement, background=known))
     if not problem.held.any() or not hazy.measurement.offset.any():
         return problem
-    as_it_is, taken_off = (_explained(one) for one in (problem, hazy))
-    return hazy if taken_off > as_it_is - TIE else problem
+    as_it_is, taken_off = (_errors(one) for one in (problem, hazy))
+    worse = taken_off - as_it_is
+    sure = worse.mean() > CHANCE * worse.std() / np.sqrt(worse.size)
+    by_more = taken_off.mean() > 10 ** (TIE / 10) * as_it_is.mean()
+    return problem if sure and by_more else hazy
 
 
-def _explained(problem: Problem) -> float:
-    """dB of the held-out pixels' variance, after a few iterations."""
+def _errors(problem: Problem) -> np.ndarray:
+    """(n,) squared errors of the held-out pixels, after a few iterations."""
     held = richardson_lucy(problem, TRIED).held_out
     assert held is not None
-    return held.explained_db
+    return (held.measured - held.predicted) ** 2

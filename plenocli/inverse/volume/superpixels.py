@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from plenocli.base.errors import InputError
+from plenocli.base.errors import InputError, UsageError
 from plenocli.base.text import by
 from plenocli.base.tiling import in_cells, in_lenslets
 from plenocli.forward.sensor.capture import SuperpixelGrid
+from plenocli.forward.sensor.cfa import cfa_map
 from plenocli.forward.sensor.frames import saturated
 from plenocli.forward.sensor.superpixel import extract
 from plenocli.inverse.calibration.calibration import there
@@ -38,6 +39,7 @@ def measured(
     *,
     where: str | Path | None = None,
     background: float = 0.0,
+    channel: str | None = None,
 ) -> Measurement:
     """Superpixels of a capture, one unit of light the mean level of the white image, or what the
     capture calls one.
@@ -48,23 +50,22 @@ def measured(
         would be behind the camera that is described. None: the capture is tiled as it says itself.
     where: the calibration's file, for messages.
     background: light without any specimen, in the same unit.
+    channel: letter of the colour filter array whose pixels count, each a sample at its own place;
+        a grey capture has none.
 
-    Raises InputError where sizes disagree or lenslets are missing.
+    Raises InputError where sizes disagree or lenslets are missing, UsageError for a channel that
+    the capture does not have, or none of those that it has.
     """
-    if capture.cfa != "mono":
-        raise InputError(
-            f"has the colour filter array {capture.cfa}; volumes are made of grey captures",
-            capture.metadata.path,
-            "use a monochrome camera",
-        )
+    channel = _asked(capture, channel)
     several = stack.lenslets
     shape = stack.pixel_shape[0] // several, stack.pixel_shape[1]
     if calibration is None:
-        found = _tiled(capture, shape, stack.lattice)
+        found = _tiled(capture, shape, stack.lattice, channel)
     else:
-        found = _resampled(capture, shape, stack.lattice, calibration, where)
+        found = _resampled(capture, shape, stack.lattice, calibration, where, channel)
         even = in_lenslets(stack.even()[None, None], several).mean(axis=(0, 1))
-        found = _evened(found, white_superpixel(calibration, shape, stack.lattice).ravel(), even)
+        white = white_superpixel(calibration, shape, stack.lattice, channel)
+        found = _evened(found, white.ravel(), even)
     usable = np.ones(found.signal.shape, bool) if found.usable is None else found.usable
     return replace(
         found,
@@ -72,6 +73,22 @@ def measured(
         usable=in_cells(usable, several),
         background=background,
     )
+
+
+def _asked(capture: Capture, channel: str | None) -> str:
+    """The letter whose pixels count."""
+    letters = sorted(set(cfa_map((2, 2), capture.cfa).flat))
+    if channel is None and len(letters) == 1:
+        return letters[0]
+    if channel is None or channel not in letters:
+        names = ", ".join(letters)
+        has = "none" if capture.cfa == "mono" else f"those of {capture.cfa}: {names}"
+        raise UsageError(
+            f"--channel {channel or 'is missing'}: of the sensor's channels {capture.name} has "
+            f"{has}; each makes a volume of its own",
+            fix="leave --channel out" if capture.cfa == "mono" else f"name one of {names}",
+        )
+    return channel
 
 
 def _evened(found: Measurement, white: np.ndarray, even: np.ndarray) -> Measurement:
@@ -84,25 +101,69 @@ def _evened(found: Measurement, white: np.ndarray, even: np.ndarray) -> Measurem
 
 
 def white_superpixel(
-    calibration: Calibration, shape: tuple[int, int], lattice: str = "square"
+    calibration: Calibration,
+    shape: tuple[int, int],
+    lattice: str = "square",
+    channel: str | None = None,
 ) -> np.ndarray:
     """Mean superpixel (row, column) of the white image, resampled to `shape`.
 
+    channel: letter of the colour filter array whose pixels count; all by default.
+
     Raises InputError where the calibration has no white image, or another lattice.
     """
+    from scipy.ndimage import uniform_filter
+
     white = calibration.white
     if white is None or white.flat is None:
         raise InputError(
             "holds no white image", "calibration", "calibrate with one (--white), as measured"
         )
     grid = calibration.grid
-    known = sampled(
+    known = _sampled(
         np.where(np.isfinite(white.flat), white.flat, np.nan),
         grid.centres[grid.valid],
         shape,
         _step(calibration, shape, lattice),
+        _corners(calibration.sensor.cfa, channel),
     )
-    return np.nan_to_num(np.nanmean(known, axis=0)).reshape(shape)
+    light = np.nansum(known, axis=0).reshape(shape)
+    count = np.isfinite(known).sum(axis=0).reshape(shape)
+    # behind lenslets an even number of pixels apart a colour is seen by the same ones everywhere
+    around = [uniform_filter(a.astype(float), 3, mode="nearest") for a in (light, count)]
+    around[1] = np.maximum(around[1], 1 / 9)
+    return np.where(count > 0, light / np.maximum(count, 1), around[0] / around[1])
+
+
+def _corners(cfa: str, channel: str | None) -> list[tuple[int, int]]:
+    """Where a channel's pixels are in the 2x2 of a colour filter array; nothing where all count."""
+    if cfa == "mono" or channel is None:
+        return []
+    return [(r, c) for r, c in np.argwhere(cfa_map((2, 2), cfa) == channel).tolist()]
+
+
+def _sampled(
+    image: np.ndarray,
+    centres: np.ndarray,
+    shape: tuple[int, int],
+    step: tuple[float, float],
+    corners: list[tuple[int, int]],
+) -> np.ndarray:
+    """As `sampled`, of each corner's pixels alone, and NaN where those of none are the nearest."""
+    if not corners:
+        return sampled(image, centres, shape, step)
+    values = np.full((*centres.shape[:-1], *shape), np.nan)
+    axes = [
+        np.rint(centres[..., axis, None] + (np.arange(n) - (n - 1) / 2) * s) % 2
+        for axis, (n, s) in enumerate(zip(shape, step))
+    ]
+    for row, column in corners:
+        every = image[row::2, column::2]
+        half = step[0] / 2, step[1] / 2
+        part = sampled(every, (centres - (row, column)) / 2, shape, half).reshape(values.shape)
+        nearest = (axes[0] == row)[..., :, None] & (axes[1] == column)[..., None, :]
+        values = np.where(nearest, part, values)
+    return values.reshape(*centres.shape[:-1], -1)
 
 
 def _step(calibration: Calibration, shape: tuple[int, int], lattice: str) -> tuple[float, float]:
@@ -130,7 +191,7 @@ def _step(calibration: Calibration, shape: tuple[int, int], lattice: str) -> tup
     return down / shape[0], right / shape[1]
 
 
-def _tiled(capture: Capture, shape: tuple[int, int], lattice: str) -> Measurement:
+def _tiled(capture: Capture, shape: tuple[int, int], lattice: str, channel: str) -> Measurement:
     path = capture.metadata.path
     own, count = (capture.grid.shape, capture.grid.count) if capture.grid else (None, None)
     if own is None or count is None:
@@ -149,6 +210,7 @@ def _tiled(capture: Capture, shape: tuple[int, int], lattice: str) -> Measuremen
     unit = capture.metadata.electrons_per_unit or 1.0
     unit *= (capture.levels.gain or 1.0) if capture.units == "DN" else 1.0
     noise, usable = capture.noise, np.isfinite(signal)
+    usable &= cfa_map(signal.shape, capture.cfa) == channel
     if np.isfinite(capture.levels.white):
         usable &= ~saturated(capture.mosaic, capture.levels.black, capture.levels.white)
     # whole pixels side by side
@@ -171,6 +233,7 @@ def _resampled(
     lattice: str,
     calibration: Calibration,
     where: str | Path | None,
+    channel: str,
 ) -> Measurement:
     grid, white = calibration.grid, calibration.white
     step = _step(calibration, shape, lattice)
@@ -188,8 +251,12 @@ def _resampled(
     if np.isfinite(capture.levels.white):
         over = saturated(capture.mosaic, capture.levels.black, capture.levels.white)
         signal = np.where(over, np.nan, signal)
-    cut = sampled(signal, grid.centres, shape, step)
+    corners = _corners(capture.cfa, channel)
+    cut = _sampled(signal, grid.centres, shape, step, corners)
     level = np.where(grid.valid, white.level, np.nan)
+    if corners and white.flat is not None:
+        own = cfa_map(white.flat.shape, capture.cfa) == channel
+        level = level * np.nanmean(white.flat[own]) / np.nanmean(white.flat)
     usual = float(np.nanmedian(level))
     lit = np.isfinite(level) & (level > DIM * usual)
     # lenslets see less towards the corners, which is no property of the specimen

@@ -145,8 +145,8 @@ class Tiles:
         known = haze(self.measurement)
         problem = without_haze(self.problem(self.brightest), known)
         self.measurement = replace(self.measurement, background=problem.measurement.background)
-        taken = float(problem.measurement.offset.mean())
-        return taken / float(self.measurement.signal.mean()) if taken else 0.0
+        taken = float(problem.measurement.offset[problem.counts].mean())
+        return taken / float(problem.measurement.signal[problem.counts].mean()) if taken else 0.0
 
     def volume(self) -> Volume:
         """The volume of all windows; the brightest one decides what "auto" takes and

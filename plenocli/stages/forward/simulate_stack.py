@@ -163,7 +163,8 @@ def _with_measured_pupil(microscope: Microscope, calibration: Path | str) -> Mic
 
     optics = optics_of(microscope)
     known = read_calibration(calibration, response=False)
-    white = white_superpixel(known, optics.pixels, optics.lattice)
+    green = "G" if "G" in known.sensor.cfa else None  # of others there are half as many
+    white = white_superpixel(known, optics.pixels, optics.lattice, green)
     found = pupil_rings(white, optics)
     note(
         f"the white image shows a pupil that reaches NA {found.aperture:.3g} (correlation "

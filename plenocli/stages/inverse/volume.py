@@ -65,6 +65,7 @@ def run_volume(
     hold_out: float = 0.05,
     background: float | Literal["auto"] = "auto",
     most_planes: int | None = None,
+    channel: str | None = None,
     device: str = "cpu",
     overwrite: bool = False,
     seed: int = 0,
@@ -81,6 +82,7 @@ def run_volume(
     background: signal without any specimen, in units of white; "auto": the haze of the darkest
         lenslets, where that predicts the held-out pixels better.
     most_planes: keep the planes that predict held-out pixels best, no more than this; None: all.
+    channel: letter of a colour sensor's pixels that are taken, each at its own place.
     device: "cpu" or "cuda", where the kernels' map multiplies and transforms.
 
     Raises UsageError, InputError, NumericsError where memory does not suffice, OutputError.
@@ -100,13 +102,14 @@ def run_volume(
     there = device_of(device)
     stack = read_stack(pif)
     known = None if calibration is None else read_calibration(calibration, response=False)
-    shot = read_capture(capture)
+    shot = read_capture(capture, cfa=None if known is None else known.sensor.cfa)
     measurement = measured(
         shot,
         stack,
         known,
         where=calibration,
         background=0.0 if background == "auto" else background,
+        channel=channel,
     )
     (rows, columns), several = measurement.signal.shape[:2], stack.lenslets
     note(

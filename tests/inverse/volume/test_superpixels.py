@@ -1,10 +1,12 @@
 """Superpixels of a hexagonal array, drawn here by formula, in the cells that kernels have."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from plenocli.base.errors import UsageError
 from plenocli.forward.sensor.capture import Capture
 from plenocli.forward.sensor.frames import Dark
 from plenocli.inverse.calibration.calibration import Calibration, Sensor, White, windows_on
@@ -71,3 +73,71 @@ def test_lenslets_come_into_the_cells_of_the_kernels(aside):
     # the discs stand in the middle of their superpixels
     disc = halves[1, 3, 0]
     assert abs(disc - disc[::-1]).max() < 0.02 * disc.max()
+
+
+COLOURS = {"R": 0.4, "G": 1.0, "B": 0.6}
+"""What pixels of a colour make of white light."""
+
+
+@pytest.fixture(scope="module")
+def in_colour():
+    """A colour sensor behind 6x7 lenslets, and lenslets' values of three colours."""
+    index = np.stack(np.meshgrid(*map(np.arange, COUNT), indexing="ij"), axis=-1)
+    centres = np.array([12.3, 12.6]) + index * np.array([13.3, 14.4])
+    shape = (96, 126)
+    grid = LensletGrid(
+        lattice="square",
+        pitch=np.array([13.3, 14.4]),
+        angle=0.0,
+        basis=np.diag([13.3, 14.4]),
+        model="affine",
+        centres=centres,
+        valid=np.ones(COUNT, bool),
+        residual=None,
+        rms=0.0,
+    )
+    colours = np.tile([["R", "G"], ["G", "B"]], (shape[0] // 2, shape[1] // 2))
+    windows, valid = windows_on(grid, shape)
+    gain = np.vectorize(COLOURS.get)(colours)
+    white = 200.0 * drawn(centres, shape, np.ones(COUNT)) * gain
+    known = Calibration(
+        grid=grid,
+        sensor=Sensor(read_noise=0.1, cfa="RGGB"),
+        windows=windows,
+        white=White.measured(white, windows, valid),
+        dark=Dark(mean=np.zeros(shape), black=np.zeros((2, 2)), exposure=None, sigma=0.1),
+    )
+    rng = np.random.default_rng(3)
+    values = {letter: rng.uniform(0.2, 1, COUNT) for letter in COLOURS}
+    parts = [drawn(centres, shape, values[c]) * gain * (colours == c) for c in COLOURS]
+    shot = Capture(mosaic=200.0 * sum(parts), cfa="RGGB")
+    stack = SimpleNamespace(
+        lattice="square", lenslets=1, pixel_shape=(13, 14), even=lambda: np.ones(13 * 14)
+    )
+    return shot, stack, known, values
+
+
+@pytest.mark.parametrize("letter", COLOURS)
+def test_a_colours_pixels_alone_tell_its_light_in_units_of_white(in_colour, letter):
+    shot, stack, known, values = in_colour
+    found = measured(shot, stack, known, channel=letter)
+    share = found.usable.mean() / measured(replace(shot, cfa="mono"), stack, known).usable.mean()
+    assert share == pytest.approx(0.5 if letter == "G" else 0.25, abs=0.03)
+    middle = np.zeros((13, 14), bool)
+    middle[4:9, 5:9] = True
+    seen = np.where(found.usable & middle.ravel(), found.signal, np.nan)
+    assert np.allclose(np.nanmean(seen, axis=2) / values[letter], 0.5, rtol=0.06)
+    white = Capture(mosaic=known.white.flat * 200.0 * COLOURS["G"], cfa="RGGB")
+    level = [
+        np.nanmean(m.signal[m.usable])
+        for m in (measured(white, stack, known, channel=c) for c in COLOURS)
+    ]
+    assert np.ptp(level) < 0.02 * level[0]
+
+
+def test_channels_that_a_sensor_does_not_have_are_refused(in_colour):
+    shot, stack, known, _ = in_colour
+    with pytest.raises(UsageError, match="B, G, R"):
+        measured(shot, stack, known)
+    with pytest.raises(UsageError, match="none"):
+        measured(replace(shot, cfa="mono"), stack, known, channel="R")

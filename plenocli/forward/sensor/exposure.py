@@ -305,18 +305,6 @@ class StoredMatrix:
 
 
 @dataclass(frozen=True)
-class _Held:
-    """A system matrix at one wavelength whose blocks were worked out; see MatrixByPoints."""
-
-    parts: list[tuple[np.ndarray, np.ndarray]]
-    offsets: np.ndarray
-
-    def blocks(self, size: int | None = None) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """The blocks that there are."""
-        yield from self.parts
-
-
-@dataclass(frozen=True)
 class StoredField:
     """The system matrices of a whole array at one wavelength, those of places of the field.
 
@@ -629,7 +617,15 @@ def _held(camera: Camera, options: ExposureOptions, made: AnyMatrix) -> AnyMatri
         "capture-sim",
         "take a smaller --refine",
     )
-    return _Held(list(made.blocks(None)), made.offsets)
+    return in_memory(made, pixels, points)
+
+
+def in_memory(made: MatrixByPoints, pixels: int, points: int) -> StoredMatrix:
+    """All of a matrix of so many pixels and object points."""
+    matrix = np.empty((len(made.offsets), pixels, points))
+    for some, block in made.blocks():
+        matrix[..., some] = block
+    return StoredMatrix(matrix, made.offsets)
 
 
 def build_matrix(camera: Camera, wavelength: float, options: ExposureOptions) -> AnyMatrix:

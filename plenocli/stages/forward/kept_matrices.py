@@ -20,6 +20,7 @@ from plenocli.forward.sensor.exposure import (
     StoredField,
     StoredMatrix,
     build_matrix,
+    in_memory,
 )
 
 if TYPE_CHECKING:
@@ -59,10 +60,7 @@ class KeptMatrices:
         def whole() -> tuple[np.ndarray, ...]:
             made = built or build_matrix(camera, wavelength, options)
             assert not isinstance(made, StoredField)
-            matrix = np.empty((len(made.offsets), pixels, points))
-            for some, block in made.blocks():
-                matrix[..., some] = block
-            return matrix, made.offsets.astype(np.float64)
+            return in_memory(made, pixels, points).matrix, made.offsets.astype(np.float64)
 
         matrix, offsets = kept(_NAME, inputs, whole)
         return StoredMatrix(matrix.astype(np.float32), offsets.astype(int))

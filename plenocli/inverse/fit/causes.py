@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -28,41 +27,10 @@ HELPS = 0.9
 """Times the noise that was likely before: a cause must explain so much."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Cause:
-    """One parameter, moved alone, that explains a capture better than the description does.
-
-    name: of the parameter; unit: of its values, "m" or "px".
-    described, value: before and after.
-    noise_ratio, noise_ratio_before: most likely noise over the noise told.
-    """
-
-    name: str
-    unit: str
-    described: float
-    value: float
-    noise_ratio: float
-    noise_ratio_before: float
-
-    @property
-    def sentence(self) -> str:
-        """What it explains, for a person."""
-        found = f"{self.value - self.described:+.2g} px"
-        if self.unit == "m":
-            size = max(abs(self.described), abs(self.value))
-            units = (("mm", 1e-3), ("um", 1e-6), ("nm", 1e-9))
-            name, unit = next((n, u) for n, u in units if size >= u or n == "nm")
-            found = f"{self.value / unit:.5g} {name} for {self.described / unit:.5g} {name}"
-        return (
-            f"of its parameters the {self.name} alone explains most ({found}: what is left over is "
-            f"{self.noise_ratio:.2g} times the noise instead of {self.noise_ratio_before:.2g})"
-        )
-
-
 def likeliest_cause(
     camera: Camera, capture: CapturedLenslets, pictures: Sequence[np.ndarray], *, seed: int = 0
-) -> Cause | None:
-    """The parameter that alone explains most of what the described camera does not.
+) -> str | None:
+    """Which parameter alone explains most of what the described camera does not, a sentence.
 
     By the slopes of the evidence and its curvature at the description, and one step along the
     parameters that promise most; some are tried either way. A hint and no measurement: paraxial,
@@ -95,12 +63,15 @@ def likeliest_cause(
     at, place = best
     if place < 0 or at.factor > HELPS * start.factor:
         return None
-    parameter = family.parameters[place]
-    return Cause(
-        name=parameter.name,
-        unit=parameter.unit,
-        described=float(family.start[place]),
-        value=float(ascent.values(at.x)[place]),
-        noise_ratio=at.factor,
-        noise_ratio_before=start.factor,
+    name, unit = family.parameters[place].name, family.parameters[place].unit
+    before, after = float(family.start[place]), float(ascent.values(at.x)[place])
+    found = f"{after - before:+.2g} px"
+    if unit == "m":
+        size = max(abs(before), abs(after))
+        units = (("mm", 1e-3), ("um", 1e-6), ("nm", 1e-9))
+        unit, scale = next((n, u) for n, u in units if size >= u or n == "nm")
+        found = f"{after / scale:.5g} {unit} for {before / scale:.5g} {unit}"
+    return (
+        f"of its parameters the {name} alone explains most ({found}: what is left over is "
+        f"{at.factor:.2g} times the noise instead of {start.factor:.2g})"
     )

@@ -100,7 +100,7 @@ def likely_cause(
     if origin is None or estimators.coupled:
         return None
     try:
-        cause = likeliest_cause(
+        return likeliest_cause(
             origin.camera,
             CapturedLenslets(y, sigma),
             estimators.prior.pictures(scene),
@@ -108,4 +108,3 @@ def likely_cause(
         )
     except PlenoError:  # a hint, and nothing that a picture depends on
         return None
-    return None if cause is None else cause.sentence

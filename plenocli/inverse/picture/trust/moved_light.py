@@ -37,9 +37,6 @@ UNUSUAL = 0.015
 right matrix, as they are not quite what their statistics say.
 """
 
-Factors = tuple[np.ndarray, np.ndarray]
-"""(pixel, k) and (k, point)."""
-
 
 def moved_light(
     system: LensletMatrix, svd: Svd, lmmse: Lmmse, y: np.ndarray, sigma: float
@@ -56,15 +53,13 @@ def moved_light(
     if min(*system.pixel_shape, *system.object_shape) < 2:
         return 0.0
     y = y[:, :: -(-y.shape[1] // LOOKED_AT)]
-    strong = svd.rank(STRONG)
-    own = svd.u[:, :strong] * svd.s[:strong], svd.vt[:strong]
-    slopes, chance = _beyond(system, own, svd, lmmse, y, sigma)
-    more, unusual = _within(system, lmmse, y, own)
+    slopes, chance = _beyond(system, svd, lmmse, y, sigma)
+    more, unusual = _within(system, lmmse, y, svd)
     return max(_deviations(slopes, chance), _deviations(slopes + more, chance + unusual))
 
 
 def _beyond(
-    system: LensletMatrix, own: Factors, svd: Svd, lmmse: Lmmse, y: np.ndarray, sigma: float
+    system: LensletMatrix, svd: Svd, lmmse: Lmmse, y: np.ndarray, sigma: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Slopes (motion,) of the likelihood of what no object gives, and their covariance."""
     # a star has far more light than brightness and pixels tell
@@ -72,7 +67,7 @@ def _beyond(
     basis = reached(svd, float(energy.mean()), sigma)
     seen = basis @ (basis.T @ y)
     rest = (y - seen).ravel() / sigma
-    moved = motions(system, lmmse.apply(seen, lmmse.scales(seen)), own) / sigma
+    moved = motions(system, lmmse.apply(seen, lmmse.scales(seen)), svd) / sigma
     moved -= basis @ np.einsum("pk,mpl->mkl", basis, moved, optimize=True)
     moved = moved.reshape(len(moved), -1)
     slopes, weighted = moved @ rest, moved * rest
@@ -81,7 +76,7 @@ def _beyond(
 
 
 def _within(
-    system: LensletMatrix, lmmse: Lmmse, y: np.ndarray, own: Factors | None = None
+    system: LensletMatrix, lmmse: Lmmse, y: np.ndarray, svd: Svd | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Slopes (motion,) of the likelihood of photographs behind what objects give, and their
     covariance, by chance and as photographs are not quite what their statistics say.
@@ -96,7 +91,7 @@ def _within(
     if not loud.any():
         return np.zeros(MOTIONS), np.zeros((MOTIONS, MOTIONS))
     power, noise = lmmse.power[loud], lmmse.noise[loud]
-    moves = lmmse.analysis[loud] @ motions(system, lmmse.gain[:, loud], own)
+    moves = lmmse.analysis[loud] @ motions(system, lmmse.gain[:, loud], svd)
     moves *= 1 - np.eye(len(power))
     w, variance = lmmse.coordinates(y)[loud], scales * power[:, None] + noise[:, None]
     pull = w / variance
@@ -147,24 +142,27 @@ def moved_even_light(
     return lmmse.analysis.T @ (moved * deviation), _as_rare(squares, len(made))
 
 
-def motions(system: LensletMatrix, x: np.ndarray, own: Factors | None = None) -> np.ndarray:
+def motions(system: LensletMatrix, x: np.ndarray, svd: Svd | None = None) -> np.ndarray:
     """(motion, pixel, signal): how superpixels of objects x (point, signal) change with the sensor
     shifted along rows and columns, magnified and turned about its middle, with the object out of
     focus, evenly and with two astigmatisms, with a pitch that is off and with two comas; in any
     units.
 
-    own: of whose product the own block is taken to be.
+    svd: of the own block, which is then taken to be what is STRONG of it.
     """
     rows, columns = system.pixel_shape
     g, h = (_places(n) for n in (rows, columns))
     g, h = g[:, None, None], h[:, None]
     p, q = (_places(n) for n in system.object_shape)
     x = x.reshape(-1, *system.object_shape, x.shape[1])
+    own = [system.own]
+    if svd is not None:
+        used = svd.rank(STRONG)
+        own = [svd.u[:, :used] * svd.s[:used], svd.vt[:used]]
 
     def shown(objects: np.ndarray) -> np.ndarray:
         flat = objects.reshape(-1, objects.shape[-1])
-        seen = system.own @ flat if own is None else own[0] @ (own[1] @ flat)
-        return seen.reshape(rows, columns, -1)
+        return np.linalg.multi_dot([*own, flat]).reshape(rows, columns, -1)
 
     down, right = np.gradient(shown(x), axis=(0, 1))
     lower, righter = (shown(part) for part in np.gradient(x, axis=(1, 2)))

@@ -65,13 +65,13 @@ def likeliest_cause(
         return None
     name, unit = family.parameters[place].name, family.parameters[place].unit
     before, after = float(family.start[place]), float(ascent.values(at.x)[place])
-    found = f"{after - before:+.2g} px"
+    moved = f"{after - before:+.2g} px"
     if unit == "m":
         size = max(abs(before), abs(after))
         units = (("mm", 1e-3), ("um", 1e-6), ("nm", 1e-9))
         unit, scale = next((n, u) for n, u in units if size >= u or n == "nm")
-        found = f"{after / scale:.5g} {unit} for {before / scale:.5g} {unit}"
+        moved = f"{after / scale:.5g} {unit} for {before / scale:.5g} {unit}"
     return (
-        f"of its parameters the {name} alone explains most ({found}: what is left over is "
+        f"of its parameters the {name} alone explains most ({moved}: what is left over is "
         f"{at.factor:.2g} times the noise instead of {start.factor:.2g})"
     )

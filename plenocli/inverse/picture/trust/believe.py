@@ -51,6 +51,8 @@ SURE, MOVED, HINT = 4.0, 3.2, 2.5
 moved, speak against the matrix by themselves, and from which on beside a picture that may not go on
 across borders.
 """
+NOISY = 0.05
+"""Noise over a capture's root mean square above which light that moved by a HINT counts."""
 CHANCE, ALLOWED = 1.0, 0.5
 """Standard deviations of chance that are taken off a factor where the matrix is not believed, and
 that it is allowed where nothing else is found: none where light moved, twice as many where it did
@@ -145,6 +147,7 @@ def believe(
         and not continuous
         and quiet
         and even <= SURE
+        and (moved <= HINT or level.sigma < NOISY * root_mean_square(y))
         and _scene_jumps(svd, lmmse, stacked, level, first)
     )
     if not found and (continuous or rough):

@@ -215,10 +215,10 @@ def _mirrored_along_one_axis(ascent: Ascent, at: Point, limit: float) -> Point:
     more likely than the one that was found: both blur alike, and where noise hides the difference
     either is a maximum of the evidence, which a fit beyond `limit` may have ended on.
     """
-    family = ascent.family
+    family, doubtful = ascent.family, at.evidence.noise_factor() > limit
     for values in family.half_mirrored(ascent.values(at.x)):
         other = ascent.point((values - family.start) / family.tolerance, finer=at.finer)
-        if at.evidence.noise_factor() > limit or _likely(other) > _likely(at) - ALMOST:
+        if doubtful or _likely(other) > _likely(at) - ALMOST:
             at = max([at, ascent.climb(other, STEPS)], key=_likely)
     return at
 

@@ -214,7 +214,9 @@ class Pair:
 
     def __init__(self, row: Interval, column: Interval, symmetric: bool) -> None:
         self.row, self.column, self.symmetric = row, column, symmetric
-        self._field = row.terms.coefficients(0) @ column.terms.coefficients(1).T
+        field = row.terms.coefficients(0) @ column.terms.coefficients(1).T
+        # alike but for what the main lens's field misses: symmetric, its core is all but diagonal
+        self._field = (field + field.T) / 2 if symmetric else field
         self.weight = float(np.linalg.norm(row.weigh @ self._field @ column.weigh.T))
 
     def factors(self, reach: float, tolerance: float) -> tuple[np.ndarray, np.ndarray, Matrix]:
@@ -261,8 +263,8 @@ class Pair:
         # separable part does not
         brings = [_energy(x) / len(self.row.side.points)]
         brings += brings if self.symmetric else [_energy(y) / len(self.column.side.points)]
-        (some,) = _strong(brings[0] * _weighed(coupling, brings[1]), tolerance / 4)
-        x, coupling = x[:, some], coupling[np.ix_(some, some)]
+        (some,) = _strong(brings[0] * _weighed(coupling, brings[1]), tolerance / 2)
+        x, coupling = x[:, some], coupling[some][:, some]
         return x, x if self.symmetric else y[:, some], coupling
 
     def _come(self) -> ObliqueWave | None:

@@ -2,13 +2,13 @@
 plenocli/forward/propagation/costs.toml.
 
 Cases are drawn from the cameras of the measured trade (tradeoff_truth.CAMERAS) and from the sample
-configurations, for every model, isolated and with neighbours, at several accuracies, until the
-budget is spent. Each is computed in a process of its own on one core; its processor time, its
-memory and the numbers of terms that were found are kept. The numbers of the laws that expect terms
-are fitted to the logarithm of what was found; then the coefficients, none below 0, to the relative
-error of times and of memory. Both are drawn to the present file as if it were so many further
-cases, so that features of which few cases tell do not run away. Run from the project's root:
-python pipelines/benchmarks/fit_costs.py --help.
+configurations, or at random (--foreign), for every model, isolated and with neighbours, at several
+accuracies, until the budget is spent. Each is computed in a process of its own on one core; its
+processor time, its memory and the numbers of terms that were found are kept. The numbers of the
+laws that expect terms are fitted to the logarithm of what was found; then the coefficients, none
+below 0, to the relative error of times and of memory. Both are drawn to the present file as if it
+were so many further cases, so that features of which few cases tell do not run away. Run
+from the project's root: python pipelines/benchmarks/fit_costs.py --help.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from multiprocessing import get_context
 from pathlib import Path
 
 from tradeoff import _resident, forced, request_of  # first: it keeps the products to one core
-from tradeoff_truth import CAMERAS, ROOT, camera_of
+from tradeoff_truth import CAMERAS, ROOT, camera_of  # makes tests importable
 
 # ruff: isort: split
 import numpy as np
@@ -53,6 +53,7 @@ from plenocli.forward.propagation.harmonics import cost_law as harmonic_cost
 from plenocli.forward.propagation.plan import NOMINAL_RATE
 from plenocli.forward.propagation.ray import rays
 from plenocli.forward.propagation.system_matrix import PifBuilder
+from tests.forward.propagation import foreign
 
 EXACT, SPREAD = "exact, low rank", "spread function"
 HARMONICS, OPENINGS = "exact, harmonics", "exact, openings"
@@ -76,6 +77,10 @@ FEATURES: dict[str, tuple[str, Callable[..., Features]]] = {
 }
 """Name of a model in the file: name in a request, what counts its features."""
 SAMPLES = ("hexagonal", "demo_spatial", "demo_spectral", "dslr", "tiny")
+FOREIGN, MORE = 1000, (1, 2, 4)
+"""Cameras of a seed of --foreign, and how many times as many points along an axis they get in turn:
+those of the tests have few.
+"""
 ACCURACIES = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-7)
 SCOPES = ("isolated", "neighbours")
 LEAST_BYTES = 32 << 20
@@ -125,6 +130,11 @@ def camera_named(name: str) -> Camera:
     plain = name.removesuffix(shape)
     if plain in CAMERAS:
         camera = camera_of(plain)
+    elif plain.startswith("foreign"):
+        seed, number = map(int, plain.split()[1:])
+        camera = foreign.case(seed, number)[0]
+        points = tuple(n * MORE[number % len(MORE)] for n in camera.object.samples_per_lenslet)
+        camera = camera.replace(**{"object.samples_per_lenslet": points})
     else:
         camera = load_camera(ROOT / "sample_configs" / f"{plain}.toml")
     if shape:
@@ -195,13 +205,17 @@ def measure(case: Case) -> Measured | None:
     )
 
 
-def drawn(most: float, seed: int) -> Iterator[Case]:
-    """All cases expected to take at most `most` seconds, at random, models and scopes in turn."""
+def drawn(most: float, seed: int, strangers: int | None) -> Iterator[Case]:
+    """All cases expected to take at most `most` seconds, at random, models and scopes in turn; with
+    a seed of `strangers` of these cameras alone.
+    """
     chance, groups = random.Random(seed), []
     for model in FEATURES:
         for scope in SCOPES:
             ends = SHAPES if model in (HARMONICS, OPENINGS) else [""]
             names = [camera + end for camera in (*CAMERAS, *SAMPLES) for end in ends]
+            if strangers is not None:
+                names = [f"foreign {strangers} {number}" for number in range(FOREIGN)]
             group = [Case(model, scope, c, a) for c in names for a in ACCURACIES]
             chance.shuffle(group)
             groups.append(group)
@@ -224,7 +238,7 @@ def measured_cases(options: argparse.Namespace) -> dict[Case, Measured]:
             case = Case(**{f.name: row.pop(f.name) for f in dataclasses.fields(Case)})
             found[case] = Measured(**row)
     spent, start = 0.0, time.monotonic()
-    for case in drawn(options.most, options.seed) if options.budget > 0 else ():
+    for case in drawn(options.most, options.seed, options.foreign) if options.budget > 0 else ():
         if case in found or (options.model and case.model not in options.model):
             continue
         # a fork has the imports but nothing that a matrix leaves behind
@@ -442,6 +456,7 @@ def main() -> None:
     parser.add_argument("--most", type=float, default=20.0, help="longest case, in seconds")
     parser.add_argument("--prior", type=float, default=0.3, help="cases that the file counts as")
     parser.add_argument("--seed", type=int, default=0, help="of the draw of cases")
+    parser.add_argument("--foreign", type=int, help="cameras at random instead, by this seed")
     parser.add_argument(
         "--model", action="append", choices=list(FEATURES), help="only this one (repeatable)"
     )

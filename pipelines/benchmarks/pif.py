@@ -21,8 +21,10 @@ import json
 import os
 import sys
 import time
+import types
 import warnings
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import PackageNotFoundError, distribution, version
+from importlib.util import find_spec
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -107,8 +109,15 @@ class Grid:
 # raises ImportError
 
 
+def old_setuptools():
+    """prysm asks pkg_resources, which setuptools has no more since 81, for its own version."""
+    if "pkg_resources" not in sys.modules and not find_spec("pkg_resources"):
+        sys.modules["pkg_resources"] = types.SimpleNamespace(get_distribution=distribution)
+
+
 def prysm_spectrum(grid):
     """Angular spectrum with the transfer function kept; units mm and um."""
+    old_setuptools()
     from prysm.propagation import angular_spectrum, angular_spectrum_transfer_function
 
     transfer = angular_spectrum_transfer_function(
@@ -124,6 +133,7 @@ def prysm_mdft(grid):
 
     Its output falls on whole steps from the axis: a tilt brings it to midpoints.
     """
+    old_setuptools()
     from prysm.propagation import focus_fixed_sampling
 
     per, z3 = 4, grid.camera.sensor.distance

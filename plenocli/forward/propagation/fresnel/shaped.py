@@ -523,6 +523,8 @@ def features(
     chord_values = lanes * chord * band.psf_nodes
     scan_values = geometry.object_shape[axis] * scan * band.psf_nodes
     heights = geometry.object_shape[axis] * scan * terms
+    kernels = places * chord * across + superpixels * scan * along
+    alone = superpixels if band.window is None else 1
     return Features(
         {
             "chords_to_sensor": 8.0 * lanes * places * chord * terms * across,
@@ -548,9 +550,12 @@ def features(
         },
         (
             {
-                "heights": item * heights * (1 if band.window is not None else superpixels),
+                "heights": item * heights * alone,
                 "spread": item * count * terms * across,
-                "kept": KEPT_BYTES,
+                "kept": sum(
+                    min(KEPT_BYTES, item * values)
+                    for values in (alone * of_axis * chord * terms, kernels)
+                ),
                 "process": 1.0,
             },
         ),

@@ -20,6 +20,7 @@ PLANNING = {
     "cost",
     "features",
     "field_features",
+    "pupil_waves",
     "valid_for",
     "error_bound",
     "paraxial_error",

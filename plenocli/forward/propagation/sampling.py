@@ -14,6 +14,7 @@ import numpy as np
 
 from plenocli.base.errors import NumericsError
 from plenocli.forward.camera.model import noll_indices
+from plenocli.forward.camera.pupil import wavefront_slope
 from plenocli.forward.camera.quadrature import band_rule, nodes_for
 from plenocli.forward.propagation.fresnel.paraxial_error import oblique_error
 from plenocli.forward.propagation.fresnel.spread_function import psf_nodes
@@ -329,13 +330,23 @@ def is_symmetric(camera: Camera) -> bool:
 
 def field_features(camera: Camera, geometry: Geometry, band: BandPlan) -> dict[str, float]:
     """What bringing the spread function into separable terms consists of: the square and the
-    cube of its nodes along an axis, of a real or a complex function.
+    cube of its nodes along an axis, of a real or a complex function, and waves of the pupil.
     """
     even = is_symmetric(camera)
     nodes = band.psf_nodes / 2 if even else band.psf_nodes
     if even and geometry.blur == 0:
         return {"field_cubed_real": nodes**3, "field_squared_real": nodes**2}
-    return {"field_cubed_complex": nodes**3, "field_squared_complex": nodes**2}
+    found = {"field_cubed_complex": nodes**3, "field_squared_complex": nodes**2}
+    return found if even else found | {"pupil_waves": pupil_waves(camera, geometry, band)}
+
+
+def pupil_waves(camera: Camera, geometry: Geometry, band: BandPlan) -> float:
+    """Nodes of a pupil without symmetry, each with as many waves as the spread function's axis has
+    nodes.
+    """
+    g, lens = geometry, camera.main_lens
+    slope = math.sqrt(2) * band.half / g.z2 + abs(g.eps) * g.D1 / 2 + wavefront_slope(lens)
+    return float(nodes_for(g.k * slope * g.D1 / 2) ** 2 * band.psf_nodes)
 
 
 def superpixels_of(count: int) -> tuple[int, int]:

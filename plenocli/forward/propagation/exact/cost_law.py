@@ -23,7 +23,12 @@ from plenocli.forward.propagation.exact.term_counts import (
     term_law,
 )
 from plenocli.forward.propagation.fresnel.spread_function import psf_nodes
-from plenocli.forward.propagation.sampling import distinct, is_symmetric, superpixels_of
+from plenocli.forward.propagation.sampling import (
+    distinct,
+    is_symmetric,
+    pupil_waves,
+    superpixels_of,
+)
 
 if TYPE_CHECKING:
     from plenocli.forward.camera.geometry import Geometry
@@ -124,7 +129,7 @@ def features(
         "spread_values": wide
         * (sizes.lit * sizes.points * sizes.few * band.psf_nodes * terms)
         * orders,
-        "columns": count,
+        "lines": count / geometry.object_shape[0],
         "sensor_values_double" if double else "sensor_values_single": count * fine,
         "written_double" if double else "written_single": written,
     }
@@ -170,11 +175,14 @@ def field_seconds(
     camera: Camera, geometry: Geometry, band: BandPlan, tolerance: float, wide: float
 ) -> dict[str, float]:
     """What bringing the main lens's field into terms consists of; on the axis the cube of its
-    nodes, `wide` times.
+    nodes, `wide` times, and waves of the pupil.
     """
     if geometry.chief != (0.0, 0.0):
         return field_work(geometry, band.half, tolerance)
-    return {"field_cubed": wide * band.psf_nodes**3 / (8 if is_symmetric(camera) else 1)}
+    if is_symmetric(camera):
+        return {"field_cubed": wide * band.psf_nodes**3 / 8}
+    waves = pupil_waves(camera, geometry, band)
+    return {"field_cubed": wide * band.psf_nodes**3, "pupil_waves": waves}
 
 
 def _pupil_share(camera: Camera, n: TermLaw) -> float:

@@ -51,7 +51,7 @@ def features(
         "kernel_values": axes * kernels * band.lenslet_nodes,
         "table_values": axes * table,
         "carried": axes * axes * carried * (item / 8),
-        "columns": columns,
+        "lines": columns / geometry.object_shape[0],
         "sensor_values_double" if double else "sensor_values_single": nodes,
         "written_double" if double else "written_single": math.prod(shape[1:]),
         **field_features(camera, geometry, band),

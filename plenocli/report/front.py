@@ -2,6 +2,7 @@
 colour; and quality over the seconds that were measured.
 """
 
+import textwrap
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -153,7 +154,7 @@ def _panel(
         ):
             scale("log")
     axes.set_xlabel("point" if x is None else label(x))
-    axes.set_ylabel(label(y))
+    axes.set_ylabel("\n".join(textwrap.wrap(label(y), 40)))
     axes.grid(True)
 
 

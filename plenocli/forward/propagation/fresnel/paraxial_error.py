@@ -65,8 +65,12 @@ def oblique_error(geometry: Geometry, parabolic: bool) -> float:
     # share of that
     part = math.sqrt(1 + geometry.blur / geometry.D2)
     rim = max(2.0, _rim_root(geometry, pupil))
-    dim = 1 + 3 * (1 - geometry.lenslet_width / geometry.D2)
-    return min(1.0, OBLIQUE * moved * rim * part * dim)
+    gap = 1 - geometry.lenslet_width / geometry.D2
+    # the pupil is seen narrower, by the cube of the angle's cosine, and so are the rings that are
+    # all the light of points between lenslets
+    narrower = 1 - (1 + (math.hypot(*geometry.chief) / geometry.z2) ** 2) ** -1.5
+    rings = narrower * math.pi * geometry.diffraction_cells * gap / math.sqrt(2)
+    return min(1.0, math.hypot(OBLIQUE * moved * rim * part * (1 + 3 * gap), rings))
 
 
 def _on_axis(geometry: Geometry, parabolic: bool) -> float:

@@ -31,16 +31,13 @@ if TYPE_CHECKING:
     from plenocli.forward.camera.model import Camera
 
 FRINGES = ((0.65, 1.0), (4.0, 2.0), (0.1, 2.0), (0.03, 2.0))
-"""Weight a N^-b of the fringes between lenslets 1, 2, ... apart in a column, N the lenslet's
-diffraction cells (measured, worst column, N from 1.3 to 140; beyond the table as its end).
-"""
+"""Weight a N^-b of the fringes between lenslets 1, 2, ... apart in a column, N their cells."""
 LAW = 0.5
 """Share of an accuracy that pixel_error may reach: it says as little as that of the true error.
 """
 WHOLE, BESIDE = (1.0, 1.0, 1.0), (0.65, 0.65, 0.3)
 """Shares of these in a column and in what superpixels beside its own hold of it in focus: fringes
-of one lenslet, of it with the next, with others (measured on four cameras of 17 to 140 diffraction
-cells: at most 0.5, 0.62 and 0.2).
+of one lenslet, of it with the next, with others (measured: at most 0.5, 0.62 and 0.2).
 """
 BESIDE_CELLS = 15
 """Diffraction cells of a lenslet from which BESIDE holds."""
@@ -73,22 +70,15 @@ UNTRIED, UNTRIED_WEIGHT = 1e-6, 3.0
 how much finer pixels are then sampled.
 """
 OTHERS = 6.0
-"""Columns tried from which on others are at most twice as bad, of few all the worse (seen of 551
-foreign cameras: 95 % of others within 3.9 times the worst of 3 columns tried, 2.1 of 6, 1.3 of
-12).
-"""
+"""Columns tried from which on others are at most twice as bad, of few all the worse."""
 ASIDE, BENT = 1.5, 4.0
 """By how much finer pixels are sampled off the axis, and how much more where that changes a column
 by its own size.
 """
 TRIED_CUT_EFFECT = 0.06
-"""The same where columns were tried, whose cut is for the dimmest point: with it what is said is
-within a factor of ten of 95 % of 349 foreign cameras' errors, with PSF_CUT_EFFECT of 87 %.
-"""
+"""The same where columns were tried, whose cut is for the dimmest point."""
 FOUND_CUT_EFFECT, COARSE_CUT = (0.1, 0.3), 3e-3
-"""The same over the root energy that is known to be cut, and over the dimmest point's, below and
-above a coarse cut (0.013 to 0.7, and 0.05 to 0.8, in 60 foreign cameras of few diffraction cells).
-"""
+"""The same over the root energy that is known to be cut, below and above a coarse cut."""
 NARROWING_LOSS = 2.0
 """Root energy that superpixels together may lose where each keeps only the terms that it needs,
 over the spread function's cut.

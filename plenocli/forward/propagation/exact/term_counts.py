@@ -105,10 +105,7 @@ def sketch_size(terms: float) -> float:
 
 
 def require_sketch(terms: float) -> None:
-    """Refuse a field of so many terms where no sketch holds them.
-
-    Raises NumericsError.
-    """
+    """Raises NumericsError for a field of so many terms that no sketch holds them."""
     if terms > FILL * MAX_SKETCH:
         raise NumericsError(
             (
@@ -121,9 +118,7 @@ def require_sketch(terms: float) -> None:
 
 
 def corner_phase(geometry: Geometry) -> float:
-    """Phase (rad) of the kernel that does not separate, at the largest displacements along both
-    axes within one superpixel.
-    """
+    """Phase (rad) of the kernel that does not separate, at a superpixel's largest displacements."""
     far = geometry.lenslet_width / 2 + max(geometry.pixel_shape) * geometry.pixel_pitch / 2
     return geometry.k * far**4 / (4 * geometry.z3**3)
 
@@ -131,11 +126,7 @@ def corner_phase(geometry: Geometry) -> float:
 def oblique_share(geometry: Geometry) -> float:
     """By how much more terms a lenslet off the axis has than one on it, 1 on the axis.
 
-    Its kernel runs through the phase k c_y c_x d_y d_x/R^3 between displacements d about the place
-    c that the chief ray goes on to, and half of k c d^3/R^3 where c lies along an axis.
-
-    Returns a number, within a third of 5 cameras' fields (11 to 103 diffraction cells, 10 to 26
-    degrees).
+    Returns a number, within a third of 5 cameras' fields (docs/model.md, "Lenslets off the axis").
     """
     if geometry.chief == (0.0, 0.0):
         return 1.0
@@ -204,8 +195,7 @@ def field_rank(
 
     aside: by how many axes (0 to 2) the superpixel lies beside the object's own.
 
-    Returns a number, within 0.55 to 1.3 of 88 tables of 8 cameras (8 to 100 diffraction cells,
-    accuracy 1e-2 to 1e-6): neighbours bring edge diffraction, which falls slowly.
+    Returns a number, within 0.55 to 1.3 of 88 tables of 8 cameras.
     """
     n = numbers or term_law()
     own = own_rank(geometry, band, parabolic, n)
@@ -251,8 +241,7 @@ def field_products(
 
     aside: as in field_rank.
 
-    Returns a number, within 0.85 to 1.35 of 18 tables of 5 cameras (6 to 102 diffraction cells,
-    25 to 225 lenslets, accuracy 1e-3 to 1e-5).
+    Returns a number, within 0.85 to 1.35 of 18 tables of 5 cameras.
     """
     n = numbers or term_law()
     own = own_products(geometry, band, parabolic, n)

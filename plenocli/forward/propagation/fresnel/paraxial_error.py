@@ -15,8 +15,7 @@ if TYPE_CHECKING:
 
 FEW_CELLS, MOST_BLUR = 5.0, 6.0
 """Diffraction cells up to which each lenslet that a blurred point lights adds its own error: the
-light of few cells goes far aside, and joins (up to 3.7 times what an isolated lenslet in focus is
-off by, blur over 2 to 8 lenslets; 29 cameras drawn at random with neighbours).
+light of few cells goes far aside, and joins.
 """
 OBLIQUE = 1.7
 """Error of the worst column over the root mean square by which rays are moved in pupil images,
@@ -45,15 +44,9 @@ def oblique_error(geometry: Geometry, parabolic: bool) -> float:
     """Estimated relative L2 difference of the worst column of a lenslet off the axis from that of
     the lenslet on it; 0 on the axis.
 
-    Rays tell: from the pupil's rim through the lenslet, each as it goes and as paraxial optics has
-    it. The mean square by which it is missed, less that on the axis, is what the angle adds (field
-    curvature, astigmatism, coma).
-
     parabolic: profile of the lenslets, else hyperbolic.
 
-    Returns a number, 1 at the most: with the error on the axis 1 to 8 times what was found in 464
-    cases (f/2.2 to f/16, 1 to 20 degrees, 3 to 26 pixels, 2 to 30 diffraction cells, blur over up
-    to 2.5 lenslets, gaps).
+    Returns a number, 1 at the most.
     docs/model.md, "Exact propagation".
     """
     if geometry.chief == (0.0, 0.0):
@@ -74,19 +67,7 @@ def oblique_error(geometry: Geometry, parabolic: bool) -> float:
 
 
 def _on_axis(geometry: Geometry, parabolic: bool) -> float:
-    """The error on the axis.
-
-    With T = D1/(2 z2) at the pupil's rim and P = D2/(2 f2) at the lenslet's, a hyperbolic lenslet
-    sends the ray through both 3/2 z3 T P (T + P) from where paraxial optics has it, a parabolic one
-    z3 P^3/2 more; sine against tangent at the main lens is a part of it. That is a share `moved` of
-    the pupil image's half width z3 T. A disc moved by it changes along its rim, which is one pixel
-    or one diffraction cell wide: over the disc's norm that is about moved sqrt(disc's width/rim's
-    width). Points beside lenslets that leave gaps are dim, and what is moved weighs more in their
-    columns.
-
-    Returns a number between 0.9 and 2.5 times the error found on 24 cameras (f/1.5 to f/64, 50 to
-    500 um, 0.4 to 10 um, 3 to 52 pixels, both profiles).
-    """
+    """The error on the axis: 0.9 to 2.5 times what was found on 24 cameras (f/1.5 to f/64)."""
     pupil, lenslet = _half_angles(geometry)
     moved = 1.5 * lenslet * (pupil + lenslet) + (lenslet**3 / (2 * pupil) if parabolic else 0.0)
     dim = 1 + 5 * (1 - geometry.lenslet_width / geometry.D2)

@@ -126,7 +126,7 @@ def corner_phase(geometry: Geometry) -> float:
 def oblique_share(geometry: Geometry) -> float:
     """By how much more terms a lenslet off the axis has than one on it, 1 on the axis.
 
-    Returns a number, within a third of 5 cameras' fields (docs/model.md, "Lenslets off the axis").
+    Returns a number, within a third of 5 cameras' fields (docs/model.md, "Exact propagation").
     """
     if geometry.chief == (0.0, 0.0):
         return 1.0

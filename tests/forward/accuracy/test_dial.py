@@ -11,7 +11,7 @@ import pytest
 from plenocli.base.errors import NumericsError, UsageError
 from plenocli.forward.accuracy import dial
 from plenocli.forward.accuracy.dial import plan_pif
-from plenocli.forward.accuracy.explain import _duration, considered, expectation, explain
+from plenocli.forward.accuracy.explain import considered, duration, expectation, explain
 from plenocli.forward.accuracy.scene_needs import SceneNeeds, sensor_noise
 from plenocli.forward.propagation.costs import Cost
 from plenocli.forward.propagation.sampling import size_band
@@ -275,4 +275,4 @@ def test_long_work_is_announced_with_what_would_take_less(ladder, monkeypatch):
     ],
 )
 def test_durations_as_people_say_them(seconds, words):
-    assert _duration(seconds) == words
+    assert duration(seconds) == words

@@ -45,10 +45,10 @@ def confine(memory: int) -> list[str]:
         most = resource.getrlimit(kind)[0] if kind == resource.RLIMIT_DATA else 0
         resource.setrlimit(kind, (most, most))
     if sys.platform != "linux":
-        return ["Landlock", "a filter of system calls"]
+        return ["Landlock", "filter of system calls"]
     libc = ctypes.CDLL(None, use_errno=True)
     libc.prctl(_NO_NEW_PRIVILEGES, 1, 0, 0, 0)
-    found = (("Landlock", _landlock(libc)), ("a filter of system calls", _no_sockets(libc)))
+    found = (("Landlock", _landlock(libc)), ("filter of system calls", _no_sockets(libc)))
     return [name for name, holds in found if not holds]
 
 

@@ -92,7 +92,7 @@ def outside(
         with _lock:
             _idle.append(child)
         if answer["missing"] and not function.__module__.startswith("plenocli.files.artefacts"):
-            _say_once(" and ".join(answer["missing"]))
+            _say_once(" and no ".join(answer["missing"]))
         return _value(answer, path, name)
 
 

@@ -2,7 +2,15 @@
 
 import numpy as np
 
-from plenocli.inverse.calibration.calibration import Calibration, Response, Sensor, White, Windows
+from plenocli.forward.sensor.frames import Dark
+from plenocli.inverse.calibration.calibration import (
+    Calibration,
+    Response,
+    Sensor,
+    White,
+    Windows,
+    windows_on,
+)
 from plenocli.inverse.grid.lenslet_grid import LensletGrid
 from plenocli.inverse.spectra.responses import LensletResponses
 
@@ -35,4 +43,34 @@ def lenslet_responses(response, wavelengths, valid, **known):
             dark=known.get("dark"),
             response=Response(matrix=response, variance=None, wavelengths=wavelengths),
         )
+    )
+
+
+def lenslet_grid(centres, basis, lattice="square"):
+    """An affine grid whose lenslets are all there: centres (row, column, 2), basis vectors as
+    columns, px.
+    """
+    return LensletGrid(
+        lattice=lattice,
+        pitch=np.linalg.norm(basis, axis=1),
+        angle=0.0,
+        basis=basis,
+        model="affine",
+        centres=centres,
+        valid=np.ones(centres.shape[:2], bool),
+        residual=None,
+        rms=0.0,
+    )
+
+
+def drawn_calibration(grid, white, cfa="mono"):
+    """Of a white image (row, column) that was drawn, without a dark level."""
+    windows, valid = windows_on(grid, white.shape)
+    assert valid.all()
+    return Calibration(
+        grid=grid,
+        sensor=Sensor(read_noise=0.1, cfa=cfa),
+        windows=windows,
+        white=White.measured(white, windows, valid),
+        dark=Dark(mean=np.zeros(white.shape), black=np.zeros((2, 2)), exposure=None, sigma=0.1),
     )

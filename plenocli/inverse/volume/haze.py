@@ -41,8 +41,8 @@ def haze(measurement: Measurement) -> np.ndarray:
     # a colour's pixels are now a few more, now a few less of a superpixel's
     whole = known >= WHOLE * known.max()
     # pixels at the pupil's edge count behind no lenslet
-    signal = np.where(usable | ~usable.any(axis=0), signal, 0)[whole]
     usable = (usable | ~usable.any(axis=0))[whole]
+    signal = np.where(usable, signal[whole], 0)
     count = max(FEWEST, int(DARKEST * len(signal)))
     if len(signal) < 4 * FEWEST:
         return np.zeros(pixels)

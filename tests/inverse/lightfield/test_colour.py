@@ -8,12 +8,12 @@ import pytest
 from plenocli.forward.sensor.capture import Capture, SuperpixelGrid
 from plenocli.forward.sensor.cfa import ColourProfile, cfa_map, preview
 from plenocli.inverse.calibration.calibration import Calibration, Response, Sensor, White, Windows
-from plenocli.inverse.grid.lenslet_grid import LensletGrid
 from plenocli.inverse.lightfield.depth import depth
 from plenocli.inverse.lightfield.gather import samples_of, samples_of_spectra
 from plenocli.inverse.lightfield.light_field import refocused
 from plenocli.inverse.lightfield.planes import slope_of
 from plenocli.inverse.lightfield.refocus import STEP
+from tests.reference.calibrations import lenslet_grid
 
 FOCAL, IMAGE, GAP, COUNT = 0.05, 0.055, 0.5e-3, 25
 PITCH = 55e-6  # of the lenslets, m
@@ -45,17 +45,8 @@ def seen(distance, scene, pixels, fine=3):
 def known_camera(pixels, cfa, white, **more):
     """Its calibration: the grid and a round white image (row, column)."""
     places = (np.arange(COUNT) + 0.5) * pixels - 0.5
-    grid = LensletGrid(
-        lattice="square",
-        pitch=np.full(2, float(pixels)),
-        angle=0.0,
-        basis=pixels * np.eye(2),
-        model="affine",
-        centres=np.stack(np.meshgrid(places, places, indexing="ij"), axis=-1),
-        valid=np.ones((COUNT, COUNT), bool),
-        residual=None,
-        rms=0.0,
-    )
+    centres = np.stack(np.meshgrid(places, places, indexing="ij"), axis=-1)
+    grid = lenslet_grid(centres, pixels * np.eye(2))
     white = White(level=np.ones((COUNT, COUNT)), flat=white.astype(np.float32))
     return Calibration(grid=grid, sensor=Sensor(cfa=cfa), white=white, **more)
 

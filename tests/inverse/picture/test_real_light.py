@@ -12,10 +12,7 @@ import plenocli as pc
 from plenocli.base.errors import InputError
 from plenocli.files.images.mosaic import read_capture
 from plenocli.forward.sensor.capture import Capture, Levels
-from plenocli.forward.sensor.frames import Dark
-from plenocli.inverse.calibration.calibration import Calibration, Sensor, White, windows_on
 from plenocli.inverse.calibration.measure import calibrate
-from plenocli.inverse.grid.lenslet_grid import LensletGrid
 from plenocli.inverse.picture import hold_out
 from plenocli.inverse.picture.estimators import Estimators, Options
 from plenocli.inverse.picture.lenslet_model import LensletMatrix
@@ -26,6 +23,7 @@ from plenocli.inverse.picture.real_light import (
     transfer_noise,
     typical_white,
 )
+from tests.reference.calibrations import drawn_calibration, lenslet_grid
 
 PITCH, COUNT, WINDOW = 12.31, (9, 10), 12
 MOVED = np.array([0.23, -0.31])
@@ -56,26 +54,8 @@ def camera(tmp_path):
     """Calibration of the drawn array, and a matrix whose even superpixel is the disc."""
     centres, shape = lenslets()
     white = 200.0 * drawn(centres, shape, np.ones(COUNT))
-    grid = LensletGrid(
-        lattice="square",
-        pitch=np.full(2, PITCH),
-        angle=0.0,
-        basis=np.eye(2) * PITCH,
-        model="affine",
-        centres=centres,
-        valid=np.ones(COUNT, bool),
-        residual=None,
-        rms=0.0,
-    )
-    windows, valid = windows_on(grid, shape)
-    assert windows.shape == (WINDOW, WINDOW) and valid.all()
-    calibration = Calibration(
-        grid=grid,
-        sensor=Sensor(read_noise=0.1),
-        windows=windows,
-        white=White.measured(white, windows, valid),
-        dark=Dark(mean=np.zeros(shape), black=np.zeros((2, 2)), exposure=None, sigma=0.1),
-    )
+    calibration = drawn_calibration(lenslet_grid(centres, np.eye(2) * PITCH), white)
+    assert calibration.windows.shape == (WINDOW, WINDOW)
     offset = np.arange(WINDOW) - (WINDOW - 1) / 2
     even = 1 / (1 + np.exp((np.hypot(offset[:, None], offset) - 4.6) / 0.55))
     blocks = np.repeat(even.reshape(1, -1, 1), 4, axis=2) / 4

@@ -8,10 +8,8 @@ import pytest
 
 from plenocli.base.errors import UsageError
 from plenocli.forward.sensor.capture import Capture
-from plenocli.forward.sensor.frames import Dark
-from plenocli.inverse.calibration.calibration import Calibration, Sensor, White, windows_on
-from plenocli.inverse.grid.lenslet_grid import LensletGrid
 from plenocli.inverse.volume.superpixels import measured
+from tests.reference.calibrations import drawn_calibration, lenslet_grid
 
 COUNT, PITCH, ROWS = (6, 7), 14.0, 13.0
 """Lenslets, px between columns, px between rows: more than 14 sqrt(3)/2, as of long pixels."""
@@ -33,25 +31,8 @@ def test_lenslets_come_into_the_cells_of_the_kernels(aside):
     centres = np.array([12.0, 12.0]) + index * np.array([ROWS, PITCH])
     centres[1 - aside :: 2, :, 1] += PITCH / 2
     shape = (96, 126)
-    grid = LensletGrid(
-        lattice="hexagonal",
-        pitch=np.array([np.hypot(ROWS, PITCH / 2), PITCH]),
-        angle=0.0,
-        basis=np.array([[ROWS, PITCH / 2], [0.0, PITCH]]),
-        model="affine",
-        centres=centres,
-        valid=np.ones(COUNT, bool),
-        residual=None,
-        rms=0.0,
-    )
-    windows, valid = windows_on(grid, shape)
-    known = Calibration(
-        grid=grid,
-        sensor=Sensor(read_noise=0.1),
-        windows=windows,
-        white=White.measured(200.0 * drawn(centres, shape, np.ones(COUNT)), windows, valid),
-        dark=Dark(mean=np.zeros(shape), black=np.zeros((2, 2)), exposure=None, sigma=0.1),
-    )
+    grid = lenslet_grid(centres, np.array([[ROWS, PITCH / 2], [0.0, PITCH]]), "hexagonal")
+    known = drawn_calibration(grid, 200.0 * drawn(centres, shape, np.ones(COUNT)))
     values = np.random.default_rng(3).uniform(0.2, 1, COUNT)
     stack = SimpleNamespace(
         lattice="hexagonal",
@@ -85,28 +66,10 @@ def in_colour():
     index = np.stack(np.meshgrid(*map(np.arange, COUNT), indexing="ij"), axis=-1)
     centres = np.array([12.3, 12.6]) + index * np.array([13.3, 14.4])
     shape = (96, 126)
-    grid = LensletGrid(
-        lattice="square",
-        pitch=np.array([13.3, 14.4]),
-        angle=0.0,
-        basis=np.diag([13.3, 14.4]),
-        model="affine",
-        centres=centres,
-        valid=np.ones(COUNT, bool),
-        residual=None,
-        rms=0.0,
-    )
     colours = np.tile([["R", "G"], ["G", "B"]], (shape[0] // 2, shape[1] // 2))
-    windows, valid = windows_on(grid, shape)
     gain = np.vectorize(COLOURS.get)(colours)
     white = 200.0 * drawn(centres, shape, np.ones(COUNT)) * gain
-    known = Calibration(
-        grid=grid,
-        sensor=Sensor(read_noise=0.1, cfa="RGGB"),
-        windows=windows,
-        white=White.measured(white, windows, valid),
-        dark=Dark(mean=np.zeros(shape), black=np.zeros((2, 2)), exposure=None, sigma=0.1),
-    )
+    known = drawn_calibration(lenslet_grid(centres, np.diag([13.3, 14.4])), white, "RGGB")
     rng = np.random.default_rng(3)
     values = {letter: rng.uniform(0.2, 1, COUNT) for letter in COLOURS}
     parts = [drawn(centres, shape, values[c]) * gain * (colours == c) for c in COLOURS]

@@ -294,24 +294,27 @@ def test_saturated_and_dead_pixels_cost_precision_not_truth(files, calibration, 
     assert np.abs((value - LIGHT * files["reflectance"]) / sigma).max() < 6
 
 
-def test_bayer_mosaic_is_part_of_the_response(tmp_path):
+def test_bayer_mosaic_is_part_of_the_response(tmp_path, capsys):
     """Odd pitch in a 2x2 mosaic: each lenslet starts on another colour, so that F differs
     between neighbours.
     """
     gains = np.tile([[0.25, 0.9], [0.9, 0.4]], (200, 200))
 
-    def paint(name, radiance, seed):
+    def paint(name, radiance, seed, cfa="RGGB"):
         response = cell()[:15, :15]
         radiance = np.broadcast_to(radiance, (9, 9, 4))
         tiles = np.einsum("rcb,yxb->rycx", radiance, response).reshape(135, 135)
         mean = np.pad(tiles, 6) * gains[:147, :147]
-        return save(tmp_path / name, mean, seed, cfa="RGGB")
+        return save(tmp_path / name, mean, seed, cfa=cfa)
 
     truth = np.random.default_rng(1).uniform(0.1, 0.8, (9, 9, 4)) * LIGHT
     white, dark, scene = paint("w.h5", LIGHT, 1), paint("d.h5", 0.0, 2), paint("s.h5", truth, 9)
     bands = [(w, paint(f"b{k}.h5", narrow(k), 3 + k)) for k, w in enumerate(BANDS)]
     report = run_calibrate(tmp_path / "c.h5", whites=[white], darks=[dark], bands=bands)
     assert report.window == [15, 15] and report.lenslets == 81
+    assert "diagonal" not in capsys.readouterr().err
+    run_calibrate(tmp_path / "g.h5", whites=[paint("wrong.h5", LIGHT, 1, cfa="GRBG")])
+    assert "as pixels of BGGR or RGGB do and those of GRBG do not" in capsys.readouterr().err
     run_demux(
         [scene], tmp_path / "o.h5", calibration=tmp_path / "c.h5", settings=Settings(method="wls")
     )

@@ -14,6 +14,24 @@ if TYPE_CHECKING:
     from plenocli.forward.camera.model import Camera
 
 MONO = "Y"
+FLAT = 0.05
+"""Change over two pixels, of the light, in the mean of all sides, up to which white is flat enough
+to compare neighbours.
+"""
+STEEP = 0.3
+"""The same to one side: beyond it there is an edge."""
+UNLIKE = 0.1
+"""Difference of two pixels in white (median of its logarithm) that are not of one colour."""
+CLEAR = 5.0
+"""Times by which one diagonal of the 2x2 pixels must differ more than the other, so that it is
+colour and not noise.
+"""
+FEWEST = 1000
+"""Pixels of a diagonal that tell."""
+LOOKED_AT = 1024
+"""px, side of the part of a white image that tells of its colours."""
+GREENS = (("GBRG", "GRBG"), ("BGGR", "RGGB"))
+"""Arrays whose greens lie along the falling diagonal, and those with them along the other."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,6 +135,39 @@ def cfa_map(shape: tuple[int, int], cfa: str, origin: tuple[int, int] = (0, 0)) 
     tile = np.array(list(cfa)).reshape(2, 2)
     rows, columns = ((np.arange(n) + first) % 2 for n, first in zip(shape, origin))
     return tile[np.ix_(rows, columns)]
+
+
+def doubted_array(white: np.ndarray, cfa: str) -> str | None:
+    """Why a white image cannot be of a colour filter array, in words; None where it can.
+
+    The two greens are alike in any light, red and blue in hardly any: of the two diagonals of 2x2
+    pixels the greens' is the one that differs less.
+    white: (row, column) even light, without the dark; its middle is looked at.
+    cfa: what the array is said to be: "mono" or four letters.
+    """
+    first = [max(0, (n - LOOKED_AT) // 4 * 2) for n in white.shape]
+    image = white[first[0] :, first[1] :][:LOOKED_AT, :LOOKED_AT]
+    image = np.where(image > 0, image, np.nan)
+    inside = image[2:-2, 2:-2]
+    two_off = image[:-4, 2:-2], image[4:, 2:-2], image[2:-2, :-4], image[2:-2, 4:]
+    diagonal = (image[1:-3, 1:-3] + image[1:-3, 3:-1] + image[3:-1, 1:-3] + image[3:-1, 3:-1]) / 4
+    flat = np.abs(sum(two_off) / (4 * inside) - 1) < FLAT
+    flat &= np.all([np.abs(pixel / inside - 1) < STEEP for pixel in two_off], axis=0)
+    contrast = np.where(flat, np.abs(np.log(inside / diagonal)), np.nan)
+    falling = np.add.outer(*(np.arange(n) % 2 for n in inside.shape)) % 2 == 0
+    sides = [side[np.isfinite(side)] for side in (contrast[falling], contrast[~falling])]
+    if min(side.size for side in sides) < FEWEST:
+        return None
+    (alike, where), (unlike, _) = sorted(
+        (float(np.median(side)), pair) for side, pair in zip(sides, GREENS)
+    )
+    others = next(pair for pair in GREENS if pair != where)
+    if unlike < max(UNLIKE, CLEAR * alike) or cfa not in ("mono", *others):
+        return None
+    return (
+        f"neighbours along one diagonal differ by {np.expm1(unlike):.0%}, along the other by "
+        f"{np.expm1(alike):.1%}, as pixels of {' or '.join(where)} do and those of {cfa} do not"
+    )
 
 
 def sensitivity(camera: Camera, wavelengths: ArrayLike) -> tuple[tuple[str, ...], np.ndarray]:

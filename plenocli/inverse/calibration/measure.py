@@ -11,6 +11,7 @@ import numpy as np
 from plenocli.base.errors import InputError, NumericsError
 from plenocli.base.progress import bar, note
 from plenocli.base.text import by
+from plenocli.forward.sensor.cfa import doubted_array
 from plenocli.forward.sensor.detector import ROUNDING, SensorModel
 from plenocli.forward.sensor.frames import bad_pixels, make_dark, merge, photon_transfer
 from plenocli.forward.sensor.noise import Noise
@@ -146,6 +147,8 @@ def calibrate(
     if whites:
         signal = _signal(whites, dark)
         _check_saturation(signal, first)
+        if said := doubted_array(signal, first.cfa):
+            note(f"warning: the white image: {said}; if the array is another one, say so by --cfa")
         found = _grid(signal, first, camera, lattice, near)
         if scenes:
             found, signal = _moved(found, signal, shots, first.cfa)

@@ -283,23 +283,21 @@ class _LensletSample:
             else self.reference.still(self.which)
         )
         bands, x = parts.shape[1] // 3, self.values(whole)
-        good = np.isfinite(x) & np.isfinite(parts[:, :bands]).all(axis=1)
+        known = np.isfinite(parts[:, :bands]).all(axis=1)
+        good = np.isfinite(x) & known
+        parts = parts if known.all() else np.where(known[:, None], parts, 0)
         x, weight = np.where(good, x, 0), good.astype(float)
-        f = np.where(good[:, None], parts[:, :bands], 0)
+        plain = _products(parts[:, :bands], weight, x)
         if self.noise is not None:
-            b = _rough(f, x)
-            expected = self.noise.variance((b[:, None] @ f)[:, 0])
+            b = _rough(plain)
+            expected = self.noise.variance((b[:, None] @ parts[:, :bands])[:, 0])
             if self.spread is not None:
                 expected = expected + b**2 @ self.spread.T
             weight = weight / np.maximum(expected, 1e-12)
-        rows = np.concatenate([f, parts[:, bands:], np.ones_like(x)[:, None], x[:, None]], axis=1)
-        rows *= np.sqrt(weight)[:, None]
-        product = _reduced(
-            rows @ np.swapaxes(rows, -1, -2),
-            bands,
-            f.sum(axis=-1) / np.maximum(good.sum(axis=-1), 1)[:, None],
-        )
-        chi = product[:, -1, -1] / np.maximum(good.sum(axis=-1) - bands, 1)
+        count = good.sum(axis=-1)
+        mean = plain[:, :bands, -2] / np.maximum(count, 1)[:, None]
+        product = _reduced(_products(parts, weight, x), bands, mean)
+        chi = product[:, -1, -1] / np.maximum(count - bands, 1)
         unit = 1.0 if self.noise is not None else max(float(np.median(chi)), 1e-30)
         weight = 1 / unit / np.maximum(1, chi / max(np.median(chi), 1e-30)) ** 2
         terms = arms.shape[1]
@@ -316,15 +314,32 @@ class _LensletSample:
         return stacked(self.smooth.at(origin, shifts, derivatives=True, sharp=False))
 
 
-def _rough(f: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Radiances (lenslet, band) by normal equations, good enough for weights; f
-    (lenslet, band, pixel).
+def _products(parts: np.ndarray, weight: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Products (lenslet, n + 2, n + 2), summed over weighted pixels, of parts, 1 and x.
+
+    parts: (lenslet, n, pixel), or (1, n, pixel) for all lenslets: then as matrix products.
+    weight, x: (lenslet, pixel).
     """
-    gram = f @ np.swapaxes(f, -1, -2)
-    gram += (1e-10 * np.trace(gram, axis1=-2, axis2=-1) + 1e-300)[:, None, None] * np.eye(
-        f.shape[-2]
-    )
-    return np.linalg.solve(gram, (f @ x[..., None]))[..., 0]
+    if len(parts) == len(x):
+        rows = np.concatenate([parts, np.ones_like(x)[:, None], x[:, None]], axis=1)
+        rows *= np.sqrt(weight)[:, None]
+        return rows @ np.swapaxes(rows, -1, -2)
+    rows, weighted = np.concatenate([parts[0], np.ones((1, x.shape[1]))]), weight * x
+    out = np.empty((len(x), len(rows) + 1, len(rows) + 1))
+    for n, row in enumerate(rows):
+        out[:, n, n:-1] = out[:, n:-1, n] = weight @ (row * rows[n:]).T
+    out[:, -1, :-1] = out[:, :-1, -1] = weighted @ rows.T
+    out[:, -1, -1] = np.vecdot(weighted, x)
+    return out
+
+
+def _rough(gram: np.ndarray) -> np.ndarray:
+    """Radiances (lenslet, band) by normal equations, good enough for weights; gram: products of F,
+    1 and x.
+    """
+    f = gram[:, :-2, :-2]
+    least = (1e-10 * np.trace(f, axis1=-2, axis2=-1) + 1e-300)[:, None, None]
+    return np.linalg.solve(f + least * np.eye(f.shape[-1]), gram[:, :-2, -1:])[..., 0]
 
 
 def _reduced(gram: np.ndarray, bands: int, mean: np.ndarray) -> np.ndarray:

@@ -171,11 +171,12 @@ class Reference:
         )
 
     def still(self, which: np.ndarray) -> np.ndarray:
-        """F and its derivatives by row and by column shift (lenslet, 3 * band, pixel)
-        where nothing moved.
+        """F and its derivatives by row and by column shift (lenslet, 3 * band, pixel), (1, ...)
+        where they are the same for all, where nothing moved.
         """
         self._make(which)
-        return np.stack([self._still[key] for key in self._keys(which)])
+        keys = self._keys(which)
+        return np.stack([self._still[key] for key in (keys[:1] if len(set(keys)) == 1 else keys)])
 
     def _keys(self, which: np.ndarray) -> list[Any]:
         """What lenslets have in common if they share a response: the colours

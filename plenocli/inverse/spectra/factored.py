@@ -31,6 +31,12 @@ FACTOR_NUMBERS = 250_000
 """Numbers of responses that are factored together."""
 STREAMED_NUMBERS = 2_000_000
 """Pixels whose factors are held at a time where none are kept."""
+SMALL_PRODUCT = 1_000_000
+"""Multiplications of a matrix product up to which OpenBLAS reads the matrices where they are; for
+larger ones it copies them first, which takes twice as long where the result has few columns.
+"""
+FEWEST_ROWS = 8
+"""Of such a product: below, the copies cost less than the calls."""
 HARD = 1e-3
 """Least eigenvalue of Q^T Q over the pixels left, below which single precision does not do."""
 Cut = Callable[[slice], np.ndarray]
@@ -377,15 +383,23 @@ def _add(target: np.ndarray, factor: float, left: np.ndarray, right: np.ndarray)
         target[:] = done.T
 
 
+def _narrow(left: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """left (n, pixel) @ right.T (pixel, few), as many rows at a time as make a SMALL_PRODUCT."""
+    most = SMALL_PRODUCT // right.size
+    if most < FEWEST_ROWS or len(left) <= most:
+        return left @ right.T
+    step = -(-len(left) // -(-len(left) // most))
+    return np.concatenate([left[i : i + step] @ right.T for i in range(0, len(left), step)])
+
+
 class _SharedBasis:
     """One basis for all lenslets: plain matrix products."""
 
     def __init__(self, q: np.ndarray) -> None:
         self.wide = q[0]  # (band, pixel)
-        self.tall = np.ascontiguousarray(self.wide.T)
         bands = len(self.wide)
         pairs = np.triu_indices(bands)
-        self.products = np.ascontiguousarray((self.wide[pairs[0]] * self.wide[pairs[1]]).T)
+        self.products = self.wide[pairs[0]] * self.wide[pairs[1]]  # (pair, pixel)
         self.unfold = np.zeros((bands, bands), int)
         self.unfold[pairs] = self.unfold[pairs[::-1]] = np.arange(len(pairs[0]))
         self.buffer = np.zeros((0, self.wide.shape[1]), np.float32)
@@ -396,7 +410,7 @@ class _SharedBasis:
 
     def project(self, part: slice, x: np.ndarray) -> np.ndarray:
         """Q^T x (lenslet, band), float64."""
-        return (x @ self.tall).astype(float)
+        return _narrow(x, self.wide).astype(float)
 
     def subtract(self, part: slice, c: np.ndarray, x: np.ndarray) -> None:
         """x - Q c in place of x; Q c was not formed."""
@@ -425,7 +439,7 @@ class _SharedBasis:
 
     def normal(self, part: slice, weight: np.ndarray) -> np.ndarray:
         """Q^T W Q (lenslet, band, band), float64."""
-        return (weight @ self.products)[:, self.unfold].astype(float)
+        return _narrow(weight, self.products)[:, self.unfold].astype(float)
 
 
 class _OwnBases:

@@ -7,7 +7,7 @@ import pytest
 
 from plenocli.forward.sensor.noise import Noise
 from plenocli.forward.sensor.superpixel import extract
-from plenocli.inverse.registration.motion import motion_since
+from plenocli.inverse.registration.motion import _products, motion_since
 from plenocli.inverse.registration.reference import Reference
 from plenocli.inverse.registration.smooth_response import SmoothResponses, spline_matrix
 from plenocli.inverse.spectra.demultiplex import demultiplex
@@ -211,3 +211,13 @@ def test_spline_matrices_move_polynomials_exactly_and_know_their_slope():
     step = 1e-5
     slope = (spline_matrix(30, 0.4 + step) - spline_matrix(30, 0.4 - step)) / (2 * step)
     np.testing.assert_allclose(spline_matrix(30, 0.4, derivative=True), slope, atol=1e-8)
+
+
+def test_products_with_parts_for_all_are_those_lenslet_by_lenslet():
+    rng = np.random.default_rng(6)
+    parts, x, weight = rng.normal(size=(1, 5, 70)), rng.normal(size=(9, 70)), rng.random((9, 70))
+    weight[rng.random(weight.shape) < 0.2] = 0
+    rows = np.concatenate([np.repeat(parts, 9, axis=0), np.ones((9, 1, 70)), x[:, None]], axis=1)
+    expected = np.einsum("lip,ljp,lp->lij", rows, rows, weight)
+    for given in (parts, np.repeat(parts, 9, axis=0)):
+        np.testing.assert_allclose(_products(given, weight, x), expected, rtol=0, atol=1e-12)

@@ -53,6 +53,15 @@ def both(response, values, method, known=None, **settings):
     )
 
 
+@pytest.mark.parametrize("least", [0, 10_000, 60_000])
+def test_products_in_pieces_are_those_of_the_whole(least, monkeypatch):
+    rng = np.random.default_rng(8)
+    monkeypatch.setattr(factored_module, "SMALL_PRODUCT", least)
+    left, right = rng.normal(size=(100, 300)), rng.normal(size=(4, 300))
+    found = factored_module._narrow(left, right)
+    np.testing.assert_allclose(found, np.einsum("ip,bp->ib", left, right), rtol=0, atol=1e-11)
+
+
 @pytest.mark.parametrize("method", ["pinv", "wls", "lmmse", "nnls"])
 def test_all_methods_agree_with_double_precision(case, method):
     response, values, _ = case

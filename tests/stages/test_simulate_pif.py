@@ -495,6 +495,7 @@ def test_a_matrix_is_computed_without_what_it_does_not_use(tmp_path):
     arguments = ["simulate-pif", str(ROOT / "sample_configs" / "seed_spatial.toml")]
     arguments += ["--superpixels", "1x1", "--coherent-ring", "0", "--model", "fresnel"]
     unused = sorted({*HEAVY, "numpy.f2py"} - {"numpy", "h5py", "pydantic", "tqdm"})
+    unused += ["plenocli.files.config.lens_file", "plenocli.files.read.scenes"]
     code = (
         "import sys; from plenocli.cli.main import run\n"
         f"assert run({[*arguments, '-o', str(tmp_path / 'pif.h5')]!r}) == 0\n"

@@ -55,7 +55,7 @@ HEADER_BYTES = 512
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _HEADER = re.compile(re.escape(MAGIC) + rb"sha256 ([0-9a-f]{64})\nbytes (\d{1,18})\n\0*\Z")
 _CHUNK_BYTES = 1 << 20
-_READ_BYTES = 1 << 22
+_READ_BYTES = 1 << 18
 _NUMBER = itertools.count()
 _LOOK_S, _SLOWEST = 10, 5 << 20
 """Processor time, s, in which HDF5 finds all objects of any file that is sound, and bytes a second

@@ -27,18 +27,13 @@ def read_camera(path: Name) -> Camera:
     description.
     """
     from plenocli.files.config.camera_file import load_camera
-    from plenocli.files.config.lens_file import load_lens
-    from plenocli.files.images.maps import read_transmittance, read_wavefront
     from plenocli.forward.camera import model
 
-    readers: dict[str, Callable[[Path], Any]] = dict(
-        zip(_NAMED, (read_transmittance, read_wavefront, load_lens))
-    )
     camera = load_camera(path)
     if isinstance(camera, model.Camera) and (asked := camera.unusual_lengths()):
         note(f"warning: {Path(path).name}: {asked}")
     for key, file in _named(path, camera).items():
-        values = readers[key](file)
+        values = _reader(key)(file)
         try:
             camera = camera.attach(**{key: values})
         except ConfigError as error:
@@ -46,6 +41,14 @@ def read_camera(path: Name) -> Camera:
                 error.what, file, f"mend it, or [main_lens] {key} in {Path(path).name}"
             ) from None
     return camera
+
+
+def _reader(key: str) -> Callable[[Path], Any]:
+    """What reads the file that a key of [main_lens] names; most cameras name none."""
+    from plenocli.files.config.lens_file import load_lens
+    from plenocli.files.images.maps import read_transmittance, read_wavefront
+
+    return dict(zip(_NAMED, (read_transmittance, read_wavefront, load_lens)))[key]
 
 
 def camera_files(path: Name, camera: Camera) -> dict[str, Name]:

@@ -87,6 +87,10 @@ def read(path: Path) -> dict[str, Law]:
 
 
 @cache
+def _fitted() -> dict[str, Law]:
+    return read(FITTED)
+
+
 def law(model: str) -> Law:
     """The Law of this name that plans are made with."""
-    return read(FITTED)[model]
+    return _fitted()[model]

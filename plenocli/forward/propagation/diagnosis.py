@@ -32,6 +32,8 @@ object is all but lost.
 LARGEST = 4000
 """Above this many object points singular values are left out: they would take minutes."""
 _ROWS = 1024
+_FEW_ROWS = 64
+"""That stay in a cache."""
 _PANEL = 64
 """Columns that the orthogonal reduction takes at a time."""
 
@@ -215,9 +217,14 @@ def symmetry_defect(own: np.ndarray) -> float:
     """max |A - A'| / max |A| for one superpixel's rows `own` (pixel, point); A' is A for the
     object turned by 180 degrees.
     """
-    peak = np.abs(own).max()
     half = (own.shape[1] + 1) // 2
-    return float(np.abs(own[:, :half] - own[:, ::-1][:, :half]).max() / peak) if peak > 0 else 0.0
+    peak = defect = 0.0
+    for start in range(0, len(own), _FEW_ROWS):
+        rows = own[start : start + _FEW_ROWS]
+        apart = rows[:, :half] - rows[:, ::-1][:, :half]
+        peak = max(peak, float(rows.max()), -float(rows.min()))
+        defect = max(defect, float(apart.max()), -float(apart.min()))
+    return defect / peak if peak > 0 else 0.0
 
 
 def seconds(camera: Camera, plan: PifPlan) -> float:

@@ -229,14 +229,14 @@ def run_simulate_pif(
     """
     from plenocli.files.config.microscope_file import describes_microscope
     from plenocli.files.read.cameras import read_camera
-    from plenocli.files.read.scene_needs import read_needs
-    from plenocli.stages.forward.simulate_stack import run_simulate_stack
 
     if not explain:
         _require_output(camera_path, output, overwrite)
     microscope = describes_microscope(camera_path)
     camera = None if microscope else read_camera(camera_path)
     if camera is None or camera.object.planes is not None:
+        from plenocli.stages.forward.simulate_stack import run_simulate_stack
+
         return run_simulate_stack(
             camera_path,
             output,
@@ -255,7 +255,7 @@ def run_simulate_pif(
             "--calibration",
             "leave it out",
         )
-    needs = read_needs(settings.scene, camera) if settings.scene else None
+    needs = _needs(settings.scene, camera)
     planes = _planes(camera, settings, needs)
     field = _field(camera, settings, needs)
     nodes = None if field is None else field[0]
@@ -275,6 +275,15 @@ def run_simulate_pif(
     several = planes or nodes
     assert several is not None
     return _write_several(task, jobs, several, output)
+
+
+def _needs(scene: Path | str | None, camera: Camera) -> SceneNeeds | None:
+    """What the scene requires; None where there is none."""
+    if not scene:
+        return None
+    from plenocli.files.read.scene_needs import read_needs
+
+    return read_needs(scene, camera)
 
 
 def _model_of_volume(settings: Settings) -> str:
@@ -349,10 +358,10 @@ def _field(
     """The places of the field that stand for the array, and the matrices to compute; None where one
     matrix was asked for.
     """
-    from plenocli.forward.accuracy.field_nodes import PlansOfPlaces, field_nodes
-
     if settings.field_nodes is None:
         return None
+    from plenocli.forward.accuracy.field_nodes import PlansOfPlaces, field_nodes
+
     for other, given in (
         ("--lenslet", settings.lenslet is not None),
         ("a scene with depth", needs is not None and needs.depth is not None),

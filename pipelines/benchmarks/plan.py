@@ -52,8 +52,14 @@ SCENES = {
     "fit": ("camera", "coins", "moon", "grass"),
     "judge": ("astronaut", "coffee", "chelsea", "rocket", "retina", "ihc", "motorcycle_left"),
 }
-SIZED = (("demo_spatial.toml", (12, 12)),)
-"""Cameras, with lenslets, by which --fit sees how costs grow."""
+SIZED = (
+    ("demo_spatial.toml", (12, 12), (16, 16)),
+    ("demo_spatial.toml", (40, 40), (16, 16)),
+    ("tiny.toml", (60, 60), (8, 8)),
+    ("seed_spatial.toml", (11, 11), (40, 40)),
+    ("seed_spatial.toml", (16, 16), (28, 28)),
+)
+"""Cameras, with lenslets and points a lenslet, by which --fit sees how costs grow."""
 FIRST = {"fit": 0, "judge": 300}
 """Number of the first case: those of the judgement below were looked at while `plan` was made."""
 ALLOWED = (0.1, 0.3, 1.0)
@@ -156,9 +162,11 @@ class Brute:
         return -10 * float(np.log10(error)), spent
 
 
-def run_sized(name, lenslets):
+def run_sized(name, lenslets, points):
     """Costs of every method on a sample camera, with and without neighbours: how they grow."""
-    camera = read_camera(TINY.with_name(name)).replace(**{"lenslet_array.count": lenslets})
+    camera = read_camera(TINY.with_name(name)).replace(
+        **{"lenslet_array.count": lenslets, "object.samples_per_lenslet": points}
+    )
     brute, rows = Brute(camera, "camera", 40.0), []
     options = [m for m in matrix_options(camera, 1e-2) if m.accuracy == 1e-2]
     for option in {m.superpixels: m for m in options}.values():
@@ -172,7 +180,7 @@ def run_sized(name, lenslets):
         for method in INVERSIONS:
             db, spent = brute.invert(system, method, data, truth)
             rows.append(row_of(camera, option, method, db, making, spent))
-    return {"case": f"{name} {lenslets}", "rows": rows, "plans": []}
+    return {"case": f"{name} {lenslets} {points}", "rows": rows, "plans": []}
 
 
 def row_of(camera, option, method, db, making, spent):
@@ -364,11 +372,11 @@ def main():
         f"95th percentile of the amount {np.quantile(np.abs(off), 0.95):.3f} ({len(off)} chains)"
     )
     if args.fit:
-        for name, lenslets in SIZED:
-            path = args.run / f"sized-{name}.json"
+        for number, sized in enumerate(SIZED):
+            path = args.run / f"sized-{number}.json"
             if not path.is_file():
                 with one_thread(), collected_notes():
-                    path.write_text(json.dumps(run_sized(name, lenslets)))
+                    path.write_text(json.dumps(run_sized(*sized)))
             records.append(json.loads(path.read_text()))
         costs.FITTED.write_text(fitted(records))
         print(f"{costs.FITTED} written")

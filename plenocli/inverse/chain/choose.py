@@ -95,7 +95,7 @@ def choose(chains: Sequence[Chain], rehearsal: Rehearsal, allowed: float) -> Cha
             break
         known[chain] = rehearsal.psnr(chain.matrix, chain.method)
     best = min(known, key=lambda chain: lost(known[chain]))
-    limit = (1 - PART) * allowed - MARGIN
+    limit = aimed_at(allowed)
     chosen = best
     for chain in chains:
         if chain.seconds >= best.seconds:
@@ -124,6 +124,11 @@ def choose(chains: Sequence[Chain], rehearsal: Rehearsal, allowed: float) -> Cha
         lenslets=rehearsal.lenslets,
         runs=rehearsal.runs,
     )
+
+
+def aimed_at(allowed: float) -> float:
+    """dB that a chain may be predicted to lose so that it loses no more than `allowed` (dB)."""
+    return max((1 - PART) * allowed - MARGIN, 0.0)
 
 
 def _by_matrix(

@@ -79,6 +79,8 @@ class PlanReport:
 
     def lines(self) -> str:
         """For people and for sh: everything but the commands is a comment."""
+        from plenocli.inverse.chain.choose import aimed_at
+
         plan = self.plan
         shown = sorted(plan.weighed, key=lambda w: w.loss)[:MOST_SHOWN]
         shown += [w for w in (plan.chosen,) if w not in shown]
@@ -91,9 +93,13 @@ class PlanReport:
             f"the signal; {plan.runs} pictures of {plan.lenslets} lenslets rehearsed in "
             f"{self.cpu_seconds:.1f} s"
         )
+        aim = (
+            f"chosen is the cheapest that is predicted to lose at most {aimed_at(plan.allowed):.3g}"
+            " dB, or the best: rehearsals miss by a little"
+        )
         hidden = len(plan.weighed) - len(shown)
         more = [f"and {hidden} that lose more"] if hidden else []
-        return "\n".join([*(f"# {line}" for line in (head, *table, *more)), *self.commands])
+        return "\n".join([*(f"# {line}" for line in (head, aim, *table, *more)), *self.commands])
 
 
 def _row(weighed: Weighed, plan: ChainPlan) -> list[str]:

@@ -70,10 +70,11 @@ class BlockToeplitz:
 
     def forward(self, x: np.ndarray) -> np.ndarray:
         """(lenslet_row, lenslet_column, point) -> (lenslet_row, lenslet_column, pixel):
-        sum_o A_o x[l - o].
+        sum_o A_o x[l - o], products in the precision of A.
         """
         x = _checked(x, self.domain)
         y = np.zeros(self.range.shape, np.result_type(self.dtype, x.dtype))
+        x = x.astype(self.dtype, copy=False)
         for block, offset in self.terms:
             source, target = _overlap(offset, self.domain.shape[:2])
             y[target] += x[source] @ block.T
@@ -81,10 +82,11 @@ class BlockToeplitz:
 
     def adjoint(self, y: np.ndarray) -> np.ndarray:
         """(lenslet_row, lenslet_column, pixel) -> (lenslet_row, lenslet_column, point):
-        sum_o A_o^T y[l + o].
+        sum_o A_o^T y[l + o], products in the precision of A.
         """
         y = _checked(y, self.range)
         x = np.zeros(self.domain.shape, np.result_type(self.dtype, y.dtype))
+        y = y.astype(self.dtype, copy=False)
         for block, offset in self.terms:
             source, target = _overlap(offset, self.domain.shape[:2])
             x[source] += y[target] @ block

@@ -2,8 +2,9 @@
 
 It lies in the folder that PLENOCLI_CACHE names (`off`: nowhere), else in plenocli under
 XDG_CACHE_HOME or ~/.cache; at most LARGEST bytes, what was not used for longest goes first. Names
-are digests of all that values depend on. A file that is damaged, or a folder that cannot be
-written, only means that values are worked out as if nothing were kept.
+are digests of all that values depend on. A file that is damaged, has another's name or another
+owner, or a folder that cannot be written, only means that values are worked out as if nothing were
+kept.
 """
 
 import contextlib
@@ -67,7 +68,7 @@ def _place(name: str, inputs: list[np.ndarray]) -> Path | None:
 
 def write_arrays(path: Path, arrays: tuple[np.ndarray, ...]) -> None:
     """Put float64 arrays, in C order, into a file, whole or not at all. Raises OutputError."""
-    head = json.dumps([_sum(arrays), [values.shape for values in arrays]]) + "\n"
+    head = json.dumps([_sum(path, arrays), [values.shape for values in arrays]]) + "\n"
     publish(path, [head.encode(), *arrays], overwrite=True)
 
 
@@ -86,28 +87,28 @@ def _digest(name: str, inputs: list[np.ndarray]) -> str:
     return digest.hexdigest()
 
 
-def _sum(arrays: tuple[np.ndarray, ...]) -> str:
-    digest = hashlib.sha256()
+def _sum(path: Path, arrays: tuple[np.ndarray, ...]) -> str:
+    digest = hashlib.sha256(path.name.encode())
     for values in arrays:
         digest.update(values.data)
     return digest.hexdigest()
 
 
 def read_arrays(path: Path) -> tuple[np.ndarray, ...] | None:
-    """The float64 arrays that `write_arrays` put into a file, None where it is missing or
-    damaged.
+    """The float64 arrays that `write_arrays` put into a file, None where it is missing,
+    damaged, under another name or somebody else's.
     """
     try:
         with open(path, "rb") as file:
             total, shapes = json.loads(file.readline(4096))
-            size = sum(8 * int(np.prod(shape)) for shape in shapes)
-            if os.fstat(file.fileno()).st_size != file.tell() + size:
+            size, about = sum(8 * int(np.prod(s)) for s in shapes), os.fstat(file.fileno())
+            if about.st_size != file.tell() + size or about.st_uid != os.geteuid():
                 return None
             arrays = tuple(
                 np.fromfile(file, np.float64, int(np.prod(shape))).reshape(shape)
                 for shape in shapes
             )
-        if _sum(arrays) != total:
+        if _sum(path, arrays) != total:
             return None
     except (OSError, ValueError, TypeError):
         return None

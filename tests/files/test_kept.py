@@ -127,3 +127,51 @@ def test_a_second_run_measures_no_photographs_and_has_the_same_bytes(place, monk
     assert not same(statistics(pictures, 2**70, keep=kept), told)
     assert not same(statistics(other, 1, keep=kept), told)
     assert len(measured) == 4
+
+
+def test_what_was_kept_of_another_matrix_or_by_another_user_is_made_again(place, monkeypatch):
+    made = []
+    wanted = decomposed(MATRIX, made)
+    (mine,) = place.iterdir()
+    decomposed(OTHER, made)
+    (other,) = set(place.iterdir()) - {mine}
+    mine.write_bytes(other.read_bytes())
+    assert same(decomposed(MATRIX, made), wanted) and len(made) == 3
+    monkeypatch.setattr(os, "geteuid", lambda: mine.stat().st_uid + 1)
+    assert same(decomposed(MATRIX, made), wanted) and len(made) == 4
+
+
+def test_a_second_run_decomposes_nothing_whatever_the_noise(place, monkeypatch):
+    """Two captures of unlike noise share what superpixels show of photographs."""
+    from plenocli.inverse.picture.lenslet_model import LensletMatrix
+    from plenocli.inverse.picture.solvers import joint_lmmse
+    from plenocli.inverse.prior.scene_prior import ScenePrior
+
+    made = []
+    for name in ("shown_directions", "ring_covariances"):
+        of = getattr(joint_lmmse, name)
+        monkeypatch.setattr(
+            joint_lmmse, name, lambda *a, of=of, name=name: made.append(name) or of(*a)
+        )
+    offsets = np.array([[r, c] for r in (-1, 0, 1) for c in (-1, 0, 1)])
+    weight = np.where(offsets.any(axis=1), 0.05, 1)[:, None, None]
+    system = LensletMatrix(
+        path=place,
+        blocks=RNG.random((9, 16, 9)) * weight,
+        offsets=offsets,
+        object_shape=(3, 3),
+        pixel_shape=(4, 4),
+    )
+    pictures = [("one", RNG.random((40, 45)))]
+
+    def joint(sigma, **options):
+        svd = Svd(*np.linalg.svd(system.own, full_matrices=False))
+        prior = ScenePrior(system, lambda: svd, lambda scene: pictures, 1, **options)
+        found = prior.joint(sigma, None)
+        return found.analysis, found.offset, found.cross, found.data, found.variance
+
+    first, again, louder = (joint(s, keep=kept) for s in (0.01, 0.01, 0.02))
+    assert made == ["shown_directions", "ring_covariances"]
+    assert same(first, again) and same(first, joint(0.01))
+    for one, other, power in zip(first, louder, (1, 1, 1, 2, 0), strict=True):
+        np.testing.assert_allclose(other * 2**power, one, rtol=1e-7, atol=1e-9 * abs(one).max())

@@ -1,6 +1,4 @@
-"""The system matrix as learn-dict and reconstruct use it: one matrix (superpixel, pixel, point)
-in float64.
-"""
+"""The system matrix as learn-dict and reconstruct use it: one matrix (superpixel, pixel, point)."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -64,13 +62,13 @@ def read_field_matrix(path: Path, *, by_band: bool = False) -> FieldMatrix | Non
 
     Raises InputError as read_lenslet_matrix.
     """
-    from plenocli.files.artefacts.container import read_artefact
+    from plenocli.files.artefacts.container import opened_artefact, read_artefact
     from plenocli.files.artefacts.shards import PIF_KINDS, read_field
 
-    artefact = read_artefact(path, PIF_KINDS)
-    if artefact.kind != "pif-field":
-        return None
-    nodes, parts = read_field(path, artefact)
+    with opened_artefact(path, PIF_KINDS, ("pif/A",), verify=False) as (artefact, _):
+        if artefact.kind != "pif-field":
+            return None
+    nodes, parts = read_field(path, read_artefact(path, PIF_KINDS))
     camera = _camera(parts[0], path)
     if camera is None:
         raise InputError("does not say for which camera it is", path, "run simulate-pif again")

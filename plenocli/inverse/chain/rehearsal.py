@@ -182,7 +182,7 @@ class Rehearsal:
         if matrix.own_only:
             alone = np.zeros((1, 2), int)
             return replace(self.pilot, blocks=own[None], offsets=alone, accuracy=record)
-        blocks = self.pilot.blocks.copy()
+        blocks = self.pilot.blocks.astype(float)
         blocks[np.flatnonzero(np.all(self.pilot.offsets == 0, axis=1))[0]] = own
         return replace(self.pilot, blocks=blocks, accuracy=record)
 

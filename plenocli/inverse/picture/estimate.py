@@ -19,7 +19,7 @@ from plenocli.forward.sensor.noise import Noise
 from plenocli.inverse.picture.diagnosis import Seen, what_is_seen
 from plenocli.inverse.picture.error_bars import of_picture, posterior
 from plenocli.inverse.picture.estimators import Estimators
-from plenocli.inverse.picture.joint import JointEstimate, estimate_jointly, left_over, own_light
+from plenocli.inverse.picture.joint import JointEstimate, estimate_jointly, left_over
 from plenocli.inverse.picture.lenslet_model import LensletMatrix, Superpixels
 from plenocli.inverse.picture.methods.method import Method, Sees
 from plenocli.inverse.picture.nuisances.clean import Cleaned, clean
@@ -143,6 +143,7 @@ def estimate(
         rows = belief.lmmse.whitening()
         looked_through = estimators.seen_through(rows)
         data = replace(data, y=data.y @ rows.T)
+        joint = None if joint is None else replace(joint, own=joint.own @ rows.T)
     truth = None if truth is None else truth / unit
     found = method.reconstruct(looked_through, data, truth, joint=joint)
     if found.sigma is not None and not belief.right:
@@ -178,7 +179,7 @@ def _cleaned(estimators: Estimators, piece: Superpixels) -> Cleaned:
     tried: list[Cleaned] = []
 
     def left(found: Cleaned) -> float:
-        return left_over(estimators, found.data.y, estimate_jointly(estimators, found.data).value)
+        return left_over(estimators, estimate_jointly(estimators, found.data))
 
     def veil_believed() -> bool:
         data = replace(piece, whole=None)
@@ -270,10 +271,10 @@ def _settle(
         )
         return _Settled(belief=belief, own=plain, joint=joint)
     joint = estimate_jointly(estimators, told)
-    own = own_light(estimators, data.y, joint.value)
+    own = joint.own
 
     def believed() -> Belief:
-        found = replace(level, found=left_over(estimators, data.y, joint.value))
+        found = replace(level, found=left_over(estimators, joint))
         inner = own[estimators.inner(own.shape[:2])] if min(own.shape[:2]) > 3 else own
         scene = data.scene
         return believe(estimators, inner, found, scene, model_error=model_error, coupled=True)

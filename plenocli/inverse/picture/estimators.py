@@ -14,9 +14,9 @@ import numpy as np
 
 from plenocli.base.linear_maps import BlockToeplitz
 from plenocli.base.progress import bar
-from plenocli.inverse.picture.lenslet_model import LensletMatrix
+from plenocli.inverse.picture.lenslet_model import Keep, LensletMatrix, work_out
 from plenocli.inverse.picture.solvers.least_squares import Svd, decompose
-from plenocli.inverse.prior.scene_prior import Keep, ReadPictures, ScenePrior, work_out
+from plenocli.inverse.prior.scene_prior import ReadPictures, ScenePrior
 from plenocli.inverse.sparse.dictionary import Dictionary
 
 INNER = (slice(1, -1), slice(1, -1))

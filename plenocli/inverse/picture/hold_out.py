@@ -89,7 +89,7 @@ def judge(
     something; nothing where there are none.
     docs/model.md, "Real light".
     """
-    even = system.blocks.sum(axis=(0, 2))
+    even = system.blocks.sum(axis=(0, 2), dtype=float)
     inner = np.zeros(y.shape[:2], bool)
     inner[1:-1, 1:-1] = True
     inner &= (weight > 0).mean(axis=2) > 0.5

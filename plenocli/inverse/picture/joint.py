@@ -22,11 +22,14 @@ class JointEstimate:
 
     value, sigma: (lenslet_row, lenslet_column, point), the picture and its standard deviation.
     scale: factor of the photographs' covariance, geometric mean of the lenslets.
+    own: (lenslet_row, lenslet_column, pixel), superpixels without the neighbours' light as this
+        picture sends it.
     """
 
     value: np.ndarray
     sigma: np.ndarray
     scale: float
+    own: np.ndarray
 
 
 def estimate_jointly(estimators: Estimators, data: Superpixels) -> JointEstimate:
@@ -50,6 +53,7 @@ def estimate_jointly(estimators: Estimators, data: Superpixels) -> JointEstimate
         value=x,
         sigma=error_bars.JOINTLY * error_bars.about(x - apart, left),
         scale=float(np.exp(np.mean(np.log(scale)))),
+        own=y,
     )
 
 
@@ -95,14 +99,19 @@ def own_light(estimators: Estimators, y: np.ndarray, x: np.ndarray) -> np.ndarra
     beyond = to_blocks(
         np.pad(planes, [(0, 0), *((reach * k, reach * k) for k in shape)], mode="symmetric"), shape
     )
-    inside = tuple(slice(reach, reach + n) for n in y.shape[:2])
-    return y - estimators.sensor(beyond.shape[:2]).neighbours_only().forward(beyond)[inside]
+    own, (rows, columns) = y.copy(), y.shape[:2]
+    for block, offset in zip(system.blocks, system.offsets):
+        if offset.any():
+            r, c = reach - offset
+            from_there = beyond[r : r + rows, c : c + columns].reshape(rows * columns, -1)
+            own -= (from_there.astype(block.dtype) @ block.T).reshape(y.shape)
+    return own
 
 
-def left_over(estimators: Estimators, y: np.ndarray, x: np.ndarray) -> float:
-    """Root mean square of y - A x over the lenslets that have all their neighbours
-    (all, where none has).
+def left_over(estimators: Estimators, joint: JointEstimate) -> float:
+    """Root mean square of what the picture does not explain, over the lenslets that have all their
+    neighbours (all, where none has).
     """
-    rest = y - estimators.sensor(y.shape[:2]).forward(x)
-    inner = rest[estimators.inner(y.shape[:2])]
+    rest = joint.own - joint.value @ estimators.system.own.T
+    inner = rest[estimators.inner(rest.shape[:2])]
     return root_mean_square(inner if inner.size else rest)

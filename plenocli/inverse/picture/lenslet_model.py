@@ -38,7 +38,8 @@ class LensletMatrix:
     """What superpixels see of objects, the wavelengths of a pif gathered into its bands.
 
     path: the pif, for messages.
-    blocks: (offset, pixel, point), points of several bands one band after the other.
+    blocks: (offset, pixel, point), points of several bands one band after the other; in single
+        precision where they were stored so.
     offsets: (offset, 2) lenslets (rows, columns) from the object to the superpixel.
     pixel_shape: (rows, columns) of a superpixel.
     object_shape: (rows, columns) of an object block in one band.
@@ -59,10 +60,10 @@ class LensletMatrix:
     illuminant: str | None = None
     origin: MatrixOrigin | None = None
 
-    @property
+    @cached_property
     def own(self) -> np.ndarray:
-        """(pixel, point) of the superpixel behind the object itself."""
-        return self.blocks[np.flatnonzero(np.all(self.offsets == 0, axis=1))[0]]
+        """(pixel, point) of the superpixel behind the object itself, float64."""
+        return np.asarray(self.blocks[np.flatnonzero(np.all(self.offsets == 0, axis=1))[0]], float)
 
     @cached_property
     def even_blocks(self) -> np.ndarray:
@@ -70,7 +71,7 @@ class LensletMatrix:
         them.
         """
         bands = max(1, len(self.bands))
-        return self.blocks.reshape(*self.blocks.shape[:2], bands, -1).sum(axis=3)
+        return self.blocks.reshape(*self.blocks.shape[:2], bands, -1).sum(axis=3, dtype=float)
 
     @cached_property
     def even(self) -> np.ndarray:
@@ -90,8 +91,11 @@ def gathered(matrices: np.ndarray, weights: np.ndarray | None = None) -> np.ndar
     matrices: (wavelength, offset, pixel, point).
     weights: (band, wavelength) share of each wavelength in a band; None: one band, equal shares.
 
-    Returns (offset, pixel, point) float64, points of several bands one band after the other.
+    Returns (offset, pixel, point) float64, points of several bands one band after the other; the
+        one matrix that there is as it is.
     """
+    if weights is None and len(matrices) == 1:
+        return matrices[0]
     if weights is None:
         weights = np.full((1, len(matrices)), 1 / len(matrices))
     bands = []
@@ -130,6 +134,19 @@ MEANS: tuple[Shared, ...] = ("contrasts", "power", "start", "veil level", "wider
 """What is a mean over pieces from all over; the others are those of the one piece."""
 Common = Callable[..., Any]
 """(name, what works it out, which of that name): the value, see Superpixels.common."""
+
+
+Keep = Callable[
+    [str, list[np.ndarray], Callable[[], tuple[np.ndarray, ...]]], tuple[np.ndarray, ...]
+]
+"""(name, all that it depends on, what works it out): the arrays, worked out now or earlier."""
+
+
+def work_out(
+    name: str, inputs: list[np.ndarray], make: Callable[[], tuple[np.ndarray, ...]]
+) -> tuple[np.ndarray, ...]:
+    """A Keep that keeps nothing."""
+    return make()
 
 
 def alone(name: Shared, work: Callable[[], Any], which: Any = None) -> Any:

@@ -85,7 +85,7 @@ def along_the_grid(
             "from where the white image has them; superpixels are taken there"
         )
     cut, white, usable = (_binned(a, window_shape, bins) for a in (cut, white, usable * 1.0))
-    even = system.blocks.sum(axis=(0, 2))
+    even = system.blocks.sum(axis=(0, 2), dtype=float)
     white, dusty = typical_white(white, lit)
     usable = (usable > 0.99) & ~dusty & (even > DARK * even.max()) & (white > 0)
     factor = np.where(usable, even / np.where(usable, white, 1.0), 0.0)

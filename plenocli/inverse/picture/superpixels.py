@@ -113,7 +113,7 @@ def _along_the_grid(
             where,
             "simulate-pif with pixels_per_lenslet as measured",
         )
-    even = system.blocks.sum(axis=(0, 2))
+    even = system.blocks.sum(axis=(0, 2), dtype=float)
     known = np.isfinite(signal) & np.isfinite(white)
     relative = np.where(known, white * _brightness(white, even, known)[:, :, None], np.nan)
     flat = falloff(relative.reshape(-1, even.size), even, system.pixel_shape).reshape(signal.shape)

@@ -9,7 +9,7 @@ from typing import TypeVar
 import numpy as np
 
 from plenocli.base.random_streams import stream
-from plenocli.inverse.picture.lenslet_model import LensletMatrix
+from plenocli.inverse.picture.lenslet_model import Keep, LensletMatrix, work_out
 from plenocli.inverse.picture.solvers import joint_lmmse, lmmse
 from plenocli.inverse.picture.solvers.least_squares import Svd
 from plenocli.inverse.prior import natural_images
@@ -23,19 +23,7 @@ KEPT = 4
 ReadPictures = Callable[[str | None], list[TrainingPicture]]
 """Gives the training pictures without the scene of this name."""
 
-Keep = Callable[
-    [str, list[np.ndarray], Callable[[], tuple[np.ndarray, ...]]], tuple[np.ndarray, ...]
-]
-"""(name, all that it depends on, what works it out): the arrays, worked out now or earlier."""
-
-_Estimator = TypeVar("_Estimator", lmmse.Lmmse, joint_lmmse.JointLmmse, np.ndarray)
-
-
-def work_out(
-    name: str, inputs: list[np.ndarray], make: Callable[[], tuple[np.ndarray, ...]]
-) -> tuple[np.ndarray, ...]:
-    """A Keep that keeps nothing."""
-    return make()
+_Estimator = TypeVar("_Estimator", lmmse.Lmmse, joint_lmmse.JointLmmse, tuple[np.ndarray, ...])
 
 
 class ScenePrior:
@@ -54,7 +42,8 @@ class ScenePrior:
         keep: Keep = work_out,
     ) -> None:
         """svd: gives that of the own block of `system`; read_pictures: called once a scene; seed:
-        of the patches drawn; keep: of mean and covariance of photographs.
+        of the patches drawn; keep: of what photographs are like, and of what superpixels show of
+        them, whatever the noise.
         """
         self.keep = keep
         self.system, self.svd, self.read_pictures, self.seed = system, svd, read_pictures, seed
@@ -62,7 +51,7 @@ class ScenePrior:
         self.statistics: dict[str | None, tuple[np.ndarray, np.ndarray]] = {}
         self._own: dict[tuple[float, str | None], lmmse.Lmmse] = {}
         self._joint: dict[tuple[float, str | None], joint_lmmse.JointLmmse] = {}
-        self._heard: dict[tuple[float, str | None], np.ndarray] = {}
+        self._heard: dict[tuple[float, str | None], tuple[np.ndarray, ...]] = {}
         self._lags: dict[str | None, tuple[float, np.ndarray]] = {}
 
     def pictures(self, scene: str | None, without: Collection[str] = ()) -> list[np.ndarray]:
@@ -119,13 +108,17 @@ class ScenePrior:
         a pixel, the loudest last (joint_lmmse.loud_directions).
         """
         self.lmmse(sigma, scene)  # draws the patches
-        return _kept(
-            self._heard,
-            (sigma, scene),
-            lambda: joint_lmmse.loud_directions(
-                self.svd(), self.statistics[scene][1], sigma, self.bands()
-            ),
+        covariance, bands = self.statistics[scene][1], self.bands()
+        least = joint_lmmse.least_power(self.svd(), covariance, sigma, bands)
+
+        def worked_out() -> tuple[np.ndarray, np.ndarray]:
+            return joint_lmmse.shown_directions(self.svd(), covariance, least, bands)
+
+        inputs = [self.system.own, covariance, bands, np.array(least)]
+        power, shown = _kept(
+            self._heard, (least, scene), lambda: self.keep("shown", inputs, worked_out)
         )
+        return shown[:, power > min(joint_lmmse.LOUD * sigma**2, power[-1] / 2)]
 
     def joint(self, sigma: float, scene: str | None) -> joint_lmmse.JointLmmse:
         """LMMSE of a block from 3x3 superpixels, at noise `sigma` of a pixel, through the loudest
@@ -137,7 +130,14 @@ class ScenePrior:
         system = self.system
         if scene not in self._lags:
             reach = joint_lmmse.needed_reach(system.object_shape, system.offsets)
-            self._lags[scene] = natural_images.autocovariance(self.pictures(scene), reach)
+            pictures = self.pictures(scene)
+
+            def measured() -> tuple[np.ndarray, np.ndarray]:
+                mean, lags = natural_images.autocovariance(pictures, reach)
+                return np.array([mean]), lags
+
+            mean, lags = self.keep("autocovariance", [np.array(reach), *pictures], measured)
+            self._lags[scene] = float(mean[0]), lags
         return joint_lmmse.prepare_joint(
             self.heard(sigma, scene)[:, -joint_lmmse.MOST :],
             system.blocks,
@@ -146,6 +146,7 @@ class ScenePrior:
             *self._lags[scene],
             sigma,
             self.bands(),
+            keep=self.keep,
         )
 
 

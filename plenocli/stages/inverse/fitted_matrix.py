@@ -72,7 +72,7 @@ def _neighbours_count(system: LensletMatrix, data: Superpixels, sigma: float) ->
     """The refusal of a matrix that knows neighbours: how strong their light is, by an even object,
     and what to do; sigma: of the noise.
     """
-    light = system.blocks.sum(axis=2)
+    light = system.blocks.sum(axis=2, dtype=float)
     stray = np.linalg.norm(light.sum(axis=0) - system.own.sum(axis=1)) / np.linalg.norm(light)
     strength = float(stray * np.sqrt(np.nanmean(data.y**2)) / sigma)
     advice = "give a pif of --superpixels 1x1: the noise hides their light"

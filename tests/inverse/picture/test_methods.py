@@ -3,6 +3,7 @@ picture.
 """
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 from plenocli.cli.inverse.reconstruct import METHODS as OFFERED
 from plenocli.forward.sensor.noise import Noise
 from plenocli.inverse.picture.estimators import Estimators, Options
+from plenocli.inverse.picture.joint import estimate_jointly, own_light
 from plenocli.inverse.picture.lenslet_model import LensletMatrix, Superpixels, Whole
 from plenocli.inverse.picture.methods.registry import METHODS, takers
 from plenocli.inverse.picture.reconstruction import Choice, ContrastScale, Reconstruction
@@ -39,6 +41,24 @@ def made(coupled, **options):
     y = estimators.sensor((4, 4)).forward(x)
     y = y + SIGMA * rng.standard_normal(y.shape)
     return estimators, Superpixels(y=y, noise=Noise.of_sigma(SIGMA)), x
+
+
+@pytest.mark.parametrize("kind", [np.float64, np.float32])
+def test_own_light_is_what_the_array_leaves_of_its_neighbours(kind):
+    """Whose matrix may be in single precision; beyond the array objects go on mirrored."""
+    estimators, data, x = made(True)
+    system = replace(estimators.system, blocks=estimators.system.blocks.astype(kind))
+    alone = x @ system.own.T
+    wide = np.pad(x.reshape(4, 4, *POINTS).swapaxes(1, 2).reshape(12, 12), 3, mode="symmetric")
+    wide = wide.reshape(6, 3, 6, 3).swapaxes(1, 2).reshape(6, 6, 9)
+    seen = sum(
+        wide[1 - r : 5 - r, 1 - c : 5 - c] @ block.T.astype(float)
+        for block, (r, c) in zip(system.blocks, RING)
+    )
+    found = own_light(estimators.with_matrix(system), seen, x)
+    np.testing.assert_allclose(found, alone, rtol=0, atol=2e-7 if kind is np.float32 else 1e-13)
+    joint = estimate_jointly(estimators, data)
+    assert np.array_equal(joint.own, own_light(estimators, data.y, joint.value))
 
 
 def test_the_command_offers_what_there_is():

@@ -13,7 +13,7 @@ import numpy as np
 from plenocli.base.progress import note
 from plenocli.inverse.picture.estimators import Estimators, root_mean_square
 from plenocli.inverse.picture.footprint import Phases
-from plenocli.inverse.picture.joint import JointEstimate, estimate_jointly, own_light
+from plenocli.inverse.picture.joint import JointEstimate, estimate_jointly
 from plenocli.inverse.picture.lenslet_model import Superpixels
 from plenocli.inverse.picture.reconstruction import (
     Choice,
@@ -166,7 +166,7 @@ class Estimator(Method):
                 trace=(choice, ContrastScale(joint.scale)),
             )
         taken = NeighboursTaken(scale=joint.scale)
-        y = own_light(estimators, data.y, joint.value)
+        y = joint.own
         if min(y.shape[:2]) <= 2:
             border = Estimate(value=joint.value, sigma=joint.sigma)
             return self._result(estimators, choice, border, taken)

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from plenocli.inverse.picture.lenslet_model import Common, alone
+from plenocli.inverse.picture.lenslet_model import Common, Keep, alone, work_out
 from plenocli.inverse.picture.solvers.least_squares import Svd
 from plenocli.inverse.picture.solvers.lmmse import given, require_noise, usual
 
@@ -31,6 +31,10 @@ CONTRASTS = 2.0 ** np.arange(-5, 5)
 LOUD = 0.005
 """Power of a direction of a superpixel over that of the noise, from which on it is worth a look:
 photographs of sixteen times the usual variance then add a twelfth to the noise.
+"""
+FAINT = 1e-9
+"""Power that a direction may have at most, over that of the strongest, of those that are not looked
+at whatever the noise.
 """
 
 
@@ -158,6 +162,8 @@ def prepare_joint(
     autocovariance: np.ndarray,
     sigma: float,
     bands: np.ndarray | Sequence[Sequence[float]] = ((1.0,),),
+    *,
+    keep: Keep = work_out,
 ) -> JointLmmse:
     """Set up LMMSE from 3x3 superpixels for a stationary scene.
 
@@ -165,7 +171,7 @@ def prepare_joint(
     estimate is exact, neighbours' light included. Covariances are inner products of each
     direction's footprint on the object with the footprints filtered by the autocovariance (FFT).
 
-    directions: (pixel, k) orthonormal, see `loud_directions`.
+    directions: (pixel, k) orthonormal, see `shown_directions`.
     blocks, offsets: (offset, pixel, point) and (offset, 2) as in BlockToeplitz, points of several
         bands one band after the other.
     object_shape: points (rows, columns) of a block in one band.
@@ -173,53 +179,70 @@ def prepare_joint(
         `needed_reach`.
     sigma: noise of a pixel, > 0.
     bands: (band, band) covariance of the bands at a point, its diagonal about 1.
+    keep: of the covariances, whatever the noise.
 
     Raises NumericsError where sigma is not positive.
     docs/model.md, "Spatial reconstruction".
     """
     require_noise(sigma)
     offsets, bands = np.asarray(offsets, int), np.asarray(bands, float)
-    (rows, columns), count = object_shape, len(bands)
+    rows, columns = object_shape
     analysis = directions.T
-    used = len(analysis)
-    response = np.stack([analysis @ block for block in np.asarray(blocks, float)])
-    footprint = _footprints(response, offsets, object_shape, used * count)
+    response = np.stack([analysis.astype(block.dtype) @ block for block in blocks]).astype(float)
     strength = np.abs(autocovariance).sum() * np.linalg.eigvalsh(bands)[-1]
-    noise = np.sqrt(sigma**2 + _rounding(footprint.reshape(used, -1), strength))
-    footprint /= np.repeat(noise, count)[:, None, None]
-    data, cross = _covariances(footprint, autocovariance, bands, used, object_shape)
+    noise = np.sqrt(sigma**2 + _rounding(response, strength))
+    data, cross = keep(
+        "ring",
+        [response, offsets, np.array(object_shape), autocovariance, bands],
+        lambda: ring_covariances(response, offsets, object_shape, autocovariance, bands),
+    )
+    each = np.tile(noise, len(_ring(RING)))
     middle = autocovariance.shape[0] // 2
     return JointLmmse(
         mean=mean,
         analysis=analysis / noise[:, None],
         offset=mean * response.sum(axis=(0, 2)) / noise,
-        cross=cross,
-        data=data,
+        cross=cross / each,
+        data=data / np.outer(each, each),
         variance=np.repeat(np.diag(bands) * autocovariance[middle, middle], rows * columns),
     )
 
 
-def loud_directions(
-    svd: Svd, covariance: np.ndarray, sigma: float, bands: np.ndarray
-) -> np.ndarray:
-    """Directions of a superpixel in which photographs have at least LOUD times the noise's power.
+def least_power(svd: Svd, covariance: np.ndarray, sigma: float, bands: np.ndarray) -> float:
+    """Power below which no direction of a superpixel is looked at: the same for all noise that is
+    not below FAINT.
+
+    svd, covariance, bands: as in `shown_directions`.
+    sigma: noise of a pixel.
+    """
+    require_noise(sigma)
+    return min(LOUD * sigma**2, FAINT * float(_strength(svd, covariance, bands)[0]))
+
+
+def _strength(svd: Svd, covariance: np.ndarray, bands: np.ndarray) -> np.ndarray:
+    """Bounds of the power of photographs in the directions of a decomposition."""
+    return svd.s**2 * np.trace(covariance) * np.linalg.eigvalsh(bands)[-1]
+
+
+def shown_directions(
+    svd: Svd, covariance: np.ndarray, least: float, bands: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Directions of a superpixel in which photographs have more than `least` power.
 
     svd: of the own block.
     covariance: (point, point) of fields of photographs in one band.
-    sigma: noise of a pixel.
     bands: (band, band) covariance of the bands at a point.
 
-    Returns (pixel, k), orthonormal, the loudest last.
+    Returns (k,) their power, ascending, and (pixel, k), orthonormal; one at least.
     """
-    require_noise(sigma)
-    least = LOUD * sigma**2
-    strength = svd.s**2 * np.trace(covariance) * np.linalg.eigvalsh(bands)[-1]
+    strength = _strength(svd, covariance, bands)
     used = max(1, min(int(np.count_nonzero(strength > least)), svd.rank()))
     seen = svd.s[:used, None] * svd.vt[:used]
     pulled = seen.reshape(used, len(bands), -1) @ covariance
     pulled = np.einsum("ab,kbp->kap", bands, pulled).reshape(seen.shape)
     power, vectors = np.linalg.eigh(pulled @ seen.T)
-    return svd.u[:, :used] @ vectors[:, power > min(least, power[-1] / 2)]
+    kept = power > min(least, power[-1] / 2)
+    return power[kept], svd.u[:, :used] @ vectors[:, kept]
 
 
 def ring_covariances(
@@ -282,15 +305,15 @@ def _covariances(
     return (data + data.T) / 2, cross
 
 
-def _rounding(footprint: np.ndarray, strength: float) -> np.ndarray:
+def _rounding(response: np.ndarray, strength: float) -> np.ndarray:
     """(coordinate,) variance that rounding may have taken away, in proportion to each coordinate's
     light: almost without noise the covariance of the data would be none.
 
-    footprint: (coordinate, point).
+    response: (offset, coordinate, point).
     strength: magnitude of the scene's covariance, summed.
     """
-    size = len(_ring(RING)) * len(footprint)
-    light = np.einsum("ij,ij->i", footprint, footprint)
+    size = len(_ring(RING)) * response.shape[1]
+    light = np.einsum("oij,oij->i", response, response)
     return size * np.finfo(float).eps * strength * light
 
 

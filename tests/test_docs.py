@@ -34,7 +34,7 @@ SMALL = {
     "[20, 20]": "[12, 12]",
     '"80 um"': '"48 um"',
     '"640 um"': '"384 um"',
-    "samples_per_lenslet = [3, 3]": "samples_per_lenslet = [2, 2]",
+    "samples_per_lenslet = [10, 10]": "samples_per_lenslet = [2, 2]",
 }
 SWEEP = {
     "[5.6, 8, 11, 16]": "[5.6, 8]",

@@ -129,7 +129,7 @@ def test_demultiplexing_beats_single_pixel_by_the_measured_and_by_the_predicted_
 ):
     text = (ROOT / "sample_configs" / "demo_spectral.toml").read_text()
     (tmp_path / "camera.toml").write_text(
-        text.replace('glass = "none" ', f'glass = "{glass}" ').replace("[3, 3]", "[12, 12]")
+        text.replace('glass = "none" ', f'glass = "{glass}" ').replace("[10, 10]", "[12, 12]")
     )
     variables = [
         f"RUN={tmp_path}/run",

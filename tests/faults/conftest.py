@@ -118,7 +118,7 @@ def _spectral_camera():
         (SAMPLES / "demo_spectral.toml")
         .read_text()
         .replace("count = [20, 30]", "count = [6, 7]")
-        .replace("samples_per_lenslet = [3, 3]", "samples_per_lenslet = [2, 2]")
+        .replace("samples_per_lenslet = [10, 10]", "samples_per_lenslet = [2, 2]")
     )
     assert "[6, 7]" in text and "[2, 2]" in text
     return text

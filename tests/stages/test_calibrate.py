@@ -445,7 +445,7 @@ def test_a_cell_that_is_much_brighter_does_not_pass_for_the_superpixel(tmp_path,
     text = (ROOT / "sample_configs" / "demo_spectral.toml").read_text()
     changes = {
         "count = [20, 30]": "count = [7, 8]",
-        "samples_per_lenslet = [3, 3]": "samples_per_lenslet = [1, 1]",
+        "samples_per_lenslet = [10, 10]": "samples_per_lenslet = [1, 1]",
     }
     for old, new in changes.items():
         assert old in text

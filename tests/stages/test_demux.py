@@ -325,7 +325,7 @@ def test_a_dark_frame_takes_off_what_the_sensor_makes_without_light(tmp_path):
         "[20, 20]": "[12, 12]",
         '"80 um"': '"48 um"',
         '"640 um"': '"384 um"',
-        "[3, 3]": "[1, 1]",
+        "[10, 10]": "[1, 1]",
         "black_level = 64\n": "",
     }.items():
         assert old in text

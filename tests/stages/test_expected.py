@@ -29,7 +29,7 @@ def dim(tmp_path_factory):
     folder = tmp_path_factory.mktemp("dim")
     text = (ROOT / "sample_configs" / "demo_spectral.toml").read_text()
     for old, new in [
-        ("[3, 3]", "[9, 9]"),  # fewer points leave fringes that an even field has not
+        ("[10, 10]", "[9, 9]"),
         ("[20, 30]", "[24, 24]"),
         ("[20, 20]", "[12, 12]"),
         ('"80 um"', '"48 um"'),

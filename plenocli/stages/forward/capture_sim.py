@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -145,6 +146,8 @@ def _exposed(
         planned = planned_accuracy(camera, options, source.wavelengths, missing)
         matrices, accuracy = None, planned.as_json()
     _tell_of_the_field(AccuracyRecord.from_json(accuracy))
+    if options.model != "ray":
+        _tell_of_the_points(camera, options.refine)
     found = simulate_capture(
         camera,
         source,
@@ -341,6 +344,26 @@ def _tell_of_the_field(record: AccuracyRecord | None) -> None:
             "all lenslets are simulated as the one on the axis: at the array's corner that is off "
             f"by about {record.field_error:.1g} of a column"
         )
+
+
+def _tell_of_the_points(camera: Camera, refine: int) -> None:
+    """Say where points are so far apart that light from between them is missed: even fields of six
+    cameras were off by 0.02 to 0.2 of a superpixel with less than half a point a diffraction cell,
+    by at most 0.004 with 0.6.
+    """
+    from plenocli.forward.camera.geometry import geometry
+
+    cells = geometry(camera, camera.light.design_wavelength).diffraction_cells
+    points = min(camera.object.samples_per_lenslet)
+    if points * refine >= cells / 2:
+        return
+    enough = math.ceil(0.6 * cells / points)
+    note(
+        f"{points * refine} points a side stand for a lenslet's field of {cells:.0f} diffraction "
+        "cells: of light between the lenslets up to a fifth of a superpixel's is missed, which "
+        "simulate-response and real captures have; "
+        + (f"--refine {enough} has it" if enough <= 8 else "more samples_per_lenslet have it")
+    )
 
 
 def _kept_matrices(camera: Camera, path: str | Path) -> KeptMatrices:

@@ -330,7 +330,7 @@ def speed(bench):
         start = time.process_time()
         first = coupled(large, light, fit)
         middle = time.process_time()
-        fine(large, first)
+        fine(large, first, light)
         end = time.process_time()
         print(
             f"10,000 lenslets of 400 pixels, {len(light.offsets)} superpixels a lenslet: coupled "

@@ -70,7 +70,6 @@ def _even_light(
         mean=np.zeros(count),
         inverse=np.linalg.inv(estimators.prior.bands() + 1e-4 * np.eye(count)),
         rho=0.0,
-        points=1,
     )
     variance = np.full(blocks.shape[1], data.known_sigma**2)
     lattice = LatticeSystem(blocks, system.offsets, variance, data.y.shape[:2], prior)

@@ -1,8 +1,8 @@
 """Radiances of all lenslets together, each with its light on its neighbours' superpixels.
 
-`coupled` has one radiance a lenslet and band, `fine` one for each of 3 x 3 points of its field, the
-answer being their mean: neighbours' light comes from their near edges, which differ from their
-means where edges lie inside fields. docs/model.md, section 9, "Neighbours".
+`coupled` has one radiance a lenslet and band, `fine` as many as the light tells apart of the points
+of its field, the answer being the points' mean: neighbours' light comes from their near edges,
+which differ from their means where edges lie inside fields. docs/model.md, section 9, "Neighbours".
 """
 
 from __future__ import annotations
@@ -13,8 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from plenocli.forward.sensor.noise import Noise
+from plenocli.inverse.spectra.field_modes import EVEN
 from plenocli.inverse.spectra.lattice_system import LatticeSystem, PointPrior
-from plenocli.inverse.spectra.neighbours import POINTS, NeighbourLight
+from plenocli.inverse.spectra.neighbours import NeighbourLight
 
 STEPS = 12
 """Of a solution, at most: the border and lost pixels take more than one."""
@@ -28,10 +29,6 @@ MOST = 2.0
 TURNS = 3
 KNOWN_TO = 0.035
 """Share of what neighbours' light changes, over the array, by which the change may be wrong."""
-FINER = 1.8
-"""By which more points than three a side would change the answers of a lenslet and those about it
-(rms) less than three instead of one did: edges between points.
-"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,7 +77,7 @@ class LatticeAnswer:
     """Radiances of one capture.
 
     value, sigma: (lenslet_row, lenslet_column, band).
-    points: (lenslet_row, lenslet_column, point * band), of which `value` is the mean.
+    points: (lenslet_row, lenslet_column, mode * band), of the field, whose mean `value` is.
     residual: (lenslet_row, lenslet_column), mean square over the expected one.
     left: (lenslet_row, lenslet_column, pixel), of the values; 0 where unknown.
     system: that was solved.
@@ -122,22 +119,19 @@ def coupled(capture: LatticeCapture, light: NeighbourLight, fit: bool = True) ->
     return _answer(system, capture, points, left, taken)
 
 
-def fine(capture: LatticeCapture, first: LatticeAnswer) -> LatticeAnswer:
-    """One radiance for each point of a field and band, with the prior that the first answer shows.
+def fine(capture: LatticeCapture, first: LatticeAnswer, light: NeighbourLight) -> LatticeAnswer:
+    """What lies where in each field, band by band, with the prior that the first answer shows.
 
     first: by `coupled`.
+    light: predicted, of the neighbours.
     """
-    from scipy.ndimage import uniform_filter
-
-    light = first.light
     blocks = light.fine(capture.response)
     blocks = blocks.reshape(*blocks.shape[:2], -1)
-    variance = _stationary(capture, first.value)
-    system = LatticeSystem(blocks, light.offsets, variance, first.value.shape[:2], _prior(first))
-    points, left = _solved(system, capture, np.tile(first.value, (1, 1, POINTS**2)))
-    found = _answer(system, capture, points, left, light)
-    between = uniform_filter((found.value - first.value) ** 2, (3, 3, 0), mode="nearest")
-    return replace(found, sigma=np.sqrt(found.sigma**2 + between / FINER**2))
+    variance, shape = _stationary(capture, first.value), first.value.shape[:2]
+    system = LatticeSystem(blocks, light.offsets, variance, shape, _prior(first))
+    even = light.modes.even[:, None] * first.value[:, :, None]
+    points, left = _solved(system, capture, even.reshape(*shape, -1))
+    return _answer(system, capture, points, left, light)
 
 
 def more_likely(capture: LatticeCapture, first: LatticeAnswer, second: LatticeAnswer) -> bool:
@@ -148,12 +142,15 @@ def more_likely(capture: LatticeCapture, first: LatticeAnswer, second: LatticeAn
     """
     points = second.system.prior
     assert points is not None
-    lenslets = replace(points, points=1, rho=points.rho**POINTS)
-    scale = np.sqrt(_stationary(capture, first.value) * max(1.0, second.misfit))
-    one, many = (
-        answer.system.surprise(answer.left / scale, answer.points, prior)
-        for answer, prior in ((first, lenslets), (second, points))
-    )
+    lenslets = replace(points, modes=EVEN)
+    variance = _stationary(capture, first.value)
+    scale = np.sqrt(variance * max(1.0, second.misfit))
+    blocks = first.light.coupled(capture.response)
+    shape = first.value.shape[:2]
+    system = LatticeSystem(blocks, first.light.offsets, variance, shape, lenslets)
+    value, left = _solved(system, capture, first.value)
+    one = system.surprise(left / scale, value, lenslets)
+    many = second.system.surprise(second.left / scale, second.points, points)
     return many < one
 
 
@@ -206,8 +203,8 @@ def _solved(
 
 
 def _mean(system: LatticeSystem, points: np.ndarray) -> np.ndarray:
-    count = system.points**2
-    return points.reshape(*points.shape[:2], count, -1).mean(axis=2)
+    mean = system.modes.mean
+    return np.einsum("rcmk,m->rck", points.reshape(*points.shape[:2], len(mean), -1), mean)
 
 
 def _answer(
@@ -337,6 +334,6 @@ def _prior(first: LatticeAnswer) -> PointPrior:
     return PointPrior(
         mean=mean,
         inverse=basis @ np.diag(1 / size) @ basis.T,
-        rho=float(alike ** (1 / POINTS)),
-        points=POINTS,
+        rho=float(alike),
+        modes=first.light.modes,
     )

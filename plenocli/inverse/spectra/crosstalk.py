@@ -61,7 +61,8 @@ class Crosstalk:
         ratio: bool = False,
     ) -> None:
         """Solve for one radiance a lenslet."""
-        self.c, self.values, self.noise, self.ratio = c, values, noise, ratio
+        self.c, self.light, self.values = c, light, values
+        self.noise, self.ratio = noise, ratio
         response, own = _common(c)
         self.capture = LatticeCapture(
             values=values,
@@ -95,7 +96,7 @@ class Crosstalk:
 
     def spectra(self, method: str) -> Spectra:
         """By "coupled", "fine" or the best of all, "auto"."""
-        many = self.first if method == "coupled" else fine(self.capture, self.first)
+        many = self.first if method == "coupled" else fine(self.capture, self.first, self.light)
         if method in METHODS:
             return self._told(many, method, method, "asked for")
         finer = more_likely(self.capture, self.first, many)

@@ -12,63 +12,82 @@ from functools import cached_property
 
 import numpy as np
 
+from plenocli.inverse.spectra.field_modes import EVEN, FieldModes
+
 PAD = 4
 """Mirrored lenslets on each side, at least."""
 IMPULSE = 16
 """Lenslets a side of the lattice on which what one pixel does to the answer is computed."""
 FAINT = 1e-4
 """Of the strongest direction of a superpixel, over the noise: fainter ones are not looked along."""
+UNTOLD = 1e-3
+"""Variance that a direction has beforehand, over the noise's, below which it tells nothing."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PointPrior:
     """Values of object points that are alike where they are near: normal, of mean `mean` and
-    covariance C rho^(points apart down + across).
+    covariance C rho^(fields apart down + across).
 
     mean: (band,).
     inverse: (band, band), of C.
-    rho: correlation of neighbouring points.
-    points: of a lenslet, a side.
+    rho: correlation of points a field apart.
+    modes: of a field, which are known of them.
     """
 
     mean: np.ndarray
     inverse: np.ndarray
     rho: float
-    points: int
+    modes: FieldModes = EVEN
+
+    @property
+    def even(self) -> np.ndarray:
+        """The mean of the unknowns (mode * band,)."""
+        return np.outer(self.modes.even, self.mean).ravel()
+
+    @property
+    def spread(self) -> np.ndarray:
+        """Standard deviations of the unknowns (mode * band,)."""
+        axis = np.diagonal(self._near())
+        modes = np.prod(axis[self.modes.kept], axis=1)
+        return np.sqrt(np.outer(modes, np.diagonal(np.linalg.inv(self.inverse)))).ravel()
 
     def precision(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-        """Inverse covariance at frequencies (n,) and (m,), radians a lenslet: (n, m, unknown,
-        unknown) complex64.
+        """Inverse covariance of modes at frequencies (n,) and (m,), radians a lenslet, all bands
+        alike: (n, m, mode, mode) complex.
         """
-        down, across = (self._axis(one).astype(np.complex64) for one in (rows, columns))
-        bands = np.einsum("ckl,ab->ckalb", across, self.inverse.astype(np.float32))
-        out = down[:, None, :, None, None, :, None, None] * bands[None, :, None, :, :, None]
-        size = self.points**2 * len(self.mean)
-        return out.reshape(len(rows), len(columns), size, size)
+        down, across = (self._axis(one) for one in (rows, columns))
+        first, second = (np.ix_(one, one) for one in self.modes.kept.T)
+        covariance = down[:, None, *first] * across[None, :, *second]
+        return np.linalg.inv(covariance)
 
     def _axis(self, frequency: np.ndarray) -> np.ndarray:
-        """Precision of one axis at frequencies (n,) in radians a lenslet: (n, point, point)."""
-        count, rho = self.points, self.rho
-        out = np.zeros((len(frequency), count, count), complex)
-        index = np.arange(count)
-        out[:, index, index] = 1 + rho**2
-        out[:, index[1:], index[:-1]] -= rho
-        out[:, index[:-1], index[1:]] -= rho
-        out[:, 0, -1] -= rho * np.exp(-1j * frequency)
-        out[:, -1, 0] -= rho * np.exp(1j * frequency)
-        return out / (1 - rho**2)
+        """Covariance of patterns along one axis at frequencies (n,): (n, pattern, pattern)."""
+        place = np.arange(self.modes.points) / self.modes.points
+        before = self.modes.weights @ self._alike(1 + place[:, None] - place) @ self.modes.weights.T
+        turn = np.exp(-1j * frequency)[:, None, None]
+        out = before * turn / (1 - self.rho * turn)
+        return self._near() + out + out.conj().swapaxes(1, 2)
 
-    def pull(self, b: np.ndarray) -> np.ndarray:
-        """Precision times (mean - b) on a periodic lattice; b (rows, columns, point * band)."""
-        rows, columns = b.shape[:2]
-        n = self.points
-        x = (self.mean - b.reshape(rows, columns, n, n, -1)).swapaxes(1, 2)
-        x = x.reshape(rows * n, columns * n, -1)
-        for axis in (0, 1):
-            x = (1 + self.rho**2) * x - self.rho * (np.roll(x, 1, axis) + np.roll(x, -1, axis))
-            x = x / (1 - self.rho**2)
-        x = (x @ self.inverse).reshape(rows, n, columns, n, -1)
-        return x.swapaxes(1, 2).reshape(b.shape)
+    def _near(self) -> np.ndarray:
+        """Covariance of patterns along an axis of one field."""
+        place = np.arange(self.modes.points) / self.modes.points
+        alike = self._alike(np.abs(place[:, None] - place))
+        return np.asarray(self.modes.weights @ alike @ self.modes.weights.T)
+
+    def _alike(self, apart: np.ndarray) -> np.ndarray:
+        return np.power(float(self.rho), apart)
+
+    def pull(self, b: np.ndarray, precision: np.ndarray) -> np.ndarray:
+        """Precision times (mean - b), b (row, column, unknown) on a periodic lattice, as rfft2.
+
+        precision: at the frequencies of rfft2.
+        """
+        from scipy.fft import rfft2
+
+        apart = rfft2((self.even - b).astype(np.float32), axes=(0, 1))
+        found = precision @ apart.reshape(*apart.shape[:2], -1, len(self.mean)) @ self.inverse
+        return found.reshape(apart.shape)
 
 
 class LatticeSystem:
@@ -79,7 +98,7 @@ class LatticeSystem:
     offsets: (block, 2), o: superpixels from the lenslet.
     variance: v (pixel,), inf where a pixel says nothing.
     shape: rows and columns of lenslets.
-    prior: of the unknowns, points times bands; None: one value a band, and no prior.
+    prior: of the unknowns, modes times bands; None: one value a band, and no prior.
     """
 
     def __init__(
@@ -95,27 +114,30 @@ class LatticeSystem:
 
         self.offsets, self.shape, self.prior = offsets, shape, prior
         self.unknowns = blocks.shape[-1]
-        self.points = 1 if prior is None else prior.points
+        self.modes = EVEN if prior is None else prior.modes
         self.padded = tuple(next_fast_len(n + 2 * PAD, real=True) for n in shape)
         there = np.concatenate(list(blocks.swapaxes(1, 2)))
         gram = (there / variance) @ there.T
         self._there = there.astype(np.float32)
         self._apart, self._products = _stencil(gram, offsets)
-        power, turn = np.linalg.eigh(gram)
-        strong = power > FAINT**2 * power[-1]
+        spread = np.ones(len(gram)) if prior is None else np.tile(prior.spread, len(offsets))
+        power, turn = np.linalg.eigh(spread[:, None] * gram * spread)
+        strong = power > (FAINT**2 * power[-1] if prior is None else UNTOLD)
         turn, size = turn[:, strong], np.sqrt(power[strong])
-        self._seen = (turn * size).astype(np.float32)
-        self._look = (there.T / variance[:, None] @ (turn / size)).astype(np.float32)
+        self._seen = (turn * size / spread[:, None]).astype(np.float32)
+        self._look = (there.T / variance[:, None] @ (turn * spread[:, None] / size)).astype(
+            np.float32
+        )
 
     def mirrored(self, inner: np.ndarray) -> np.ndarray:
         """Unknowns (rows, columns, unknown) as a padded array, object points mirrored."""
-        n, (rows, columns) = self.points, self.shape
-        margins = [
-            (PAD * n, (size - count - PAD) * n) for size, count in zip(self.padded, self.shape)
-        ]
-        x = inner.reshape(rows, columns, n, n, -1).swapaxes(1, 2).reshape(rows * n, columns * n, -1)
-        x = np.pad(x, [*margins, (0, 0)], mode="symmetric")
-        x = x.reshape(self.padded[0], n, self.padded[1], n, -1).swapaxes(1, 2)
+        places, turned = zip(*(_beyond(n, size) for n, size in zip(self.shape, self.padded)))
+        x = inner[np.ix_(*places)]
+        if len(self.modes.kept) > 1:
+            x = x.reshape(*self.padded, len(self.modes.kept), -1)
+            down, across = self.modes.mirrored
+            x[turned[0]] = down @ x[turned[0]]
+            x[:, turned[1]] = across @ x[:, turned[1]]
         return x.reshape(*self.padded, -1)
 
     def inner(self, padded: np.ndarray) -> np.ndarray:
@@ -171,7 +193,10 @@ class LatticeSystem:
         Returns (len(rows), len(columns), unknown, unknown) complex64.
         """
         out = self._information(rows, columns)
-        return out if self.prior is None else out + self.prior.precision(rows, columns)
+        if self.prior is None:
+            return out
+        before = self.prior.precision(rows, columns).astype(np.complex64)
+        return out + np.kron(before, self.prior.inverse.astype(np.float32))
 
     def _information(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
         phases = [
@@ -182,26 +207,30 @@ class LatticeSystem:
         out = phase @ self._products.reshape(len(self._apart), -1)
         return out.reshape(len(rows), len(columns), self.unknowns, self.unknowns)
 
+    @property
+    def _frequencies(self) -> tuple[np.ndarray, np.ndarray]:
+        rows, columns = self.padded
+        return 2 * np.pi * np.fft.fftfreq(rows), 2 * np.pi * np.fft.rfftfreq(columns)
+
     @cached_property
     def _inverse(self) -> np.ndarray:
         """Of `normal`, at the frequencies of the padded array: every step takes it, and what its
         rounding leaves, the next one finds.
         """
-        rows, columns = self.padded
-        normal = self.normal(2 * np.pi * np.fft.fftfreq(rows), 2 * np.pi * np.fft.rfftfreq(columns))
-        try:
-            return np.linalg.inv(normal)
-        except np.linalg.LinAlgError:
-            # unknowns that light does not tell apart, as of two bands alike: rounding alone is left
-            size = np.trace(normal, axis1=2, axis2=3).real[..., None, None]
-            least = 4 * np.finfo(np.float32).eps * size * np.eye(self.unknowns)
-            return np.linalg.inv(normal + least.astype(np.float32))
+        return _inverted(self.normal(*self._frequencies))
 
-    def solve(self, right: np.ndarray) -> np.ndarray:
-        """N^-1 of a padded array."""
+    @cached_property
+    def _before(self) -> np.ndarray | None:
+        """The prior's precision at the same frequencies."""
+        if self.prior is None:
+            return None
+        return self.prior.precision(*self._frequencies).astype(np.complex64)
+
+    def solve(self, right: np.ndarray, pull: np.ndarray | float = 0.0) -> np.ndarray:
+        """N^-1 of a padded array, and of what is added to its spectrum."""
         from scipy.fft import irfft2, rfft2
 
-        spectrum = rfft2(right.astype(np.float32), axes=(0, 1))
+        spectrum = rfft2(right.astype(np.float32), axes=(0, 1)) + pull
         found = (self._inverse @ spectrum[..., None])[..., 0]
         return irfft2(found, s=self.padded, axes=(0, 1)).astype(float)
 
@@ -210,10 +239,10 @@ class LatticeSystem:
 
         left: of the superpixels' directions.
         """
-        right = self.back(left)
-        if self.prior is not None:
-            right = right + self.prior.pull(b)
-        return self.inner(self.solve(right))
+        pull: np.ndarray | float = 0.0
+        if self.prior is not None and self._before is not None:
+            pull = self.prior.pull(b, self._before)
+        return self.inner(self.solve(self.back(left), pull))
 
     def surprise(self, left: np.ndarray, points: np.ndarray, prior: PointPrior) -> float:
         """-2 ln of the evidence a lenslet (but for what all systems of a capture share): what is
@@ -224,12 +253,15 @@ class LatticeSystem:
         points: the answer, inner.
         prior: the system's, or one for a system that was solved without.
         """
+        from scipy.fft import irfft2
+
         frequency = 2 * np.pi * np.fft.fftfreq(IMPULSE)
-        before = prior.precision(frequency, frequency).astype(complex)
+        before = np.kron(prior.precision(frequency, frequency), prior.inverse)
         after = self._information(frequency, frequency) + before
         ruled_out = np.linalg.slogdet(after)[1] - np.linalg.slogdet(before)[1]
-        pull = self.inner(prior.pull(self.mirrored(points)))
-        apart = points - np.tile(prior.mean, prior.points**2)
+        pulled = prior.pull(self.mirrored(points), prior.precision(*self._frequencies))
+        pull = self.inner(irfft2(pulled, s=self.padded, axes=(0, 1)))
+        apart = points - prior.even
         lenslets = self.shape[0] * self.shape[1]
         return float(((left**2).sum() - (apart * pull).sum()) / lenslets + ruled_out.mean())
 
@@ -242,8 +274,8 @@ class LatticeSystem:
         """
         frequency = 2 * np.pi * np.fft.fftfreq(IMPULSE)
         normal = self.normal(frequency, frequency)
-        bands = self.unknowns // self.points**2
-        mean = np.tile(np.eye(bands), (self.points**2, 1)) / self.points**2
+        bands = self.unknowns // len(self.modes.kept)
+        mean = np.kron(self.modes.mean[:, None], np.eye(bands))
         turned = np.linalg.solve(normal, np.broadcast_to(mean, (*normal.shape[:3], bands)))
         posterior = np.einsum("dk,rcdk->k", mean, turned).real / IMPULSE**2
         spread = np.fft.ifft2(turned, axes=(0, 1)).real  # (row, column, unknown, band)
@@ -257,6 +289,26 @@ class LatticeSystem:
                 at = spread[(i - down) % IMPULSE, (j - across) % IMPULSE]
                 h[d] += (back[:, k] @ at).T
         return where, h, posterior
+
+
+def _inverted(normal: np.ndarray) -> np.ndarray:
+    """Of matrices (row, column, unknown, unknown)."""
+    try:
+        return np.linalg.inv(normal)
+    except np.linalg.LinAlgError:
+        # unknowns that light does not tell apart, as of two bands alike: rounding alone is left
+        size = np.trace(normal, axis1=2, axis2=3).real[..., None, None]
+        least = 4 * np.finfo(np.float32).eps * size * np.eye(normal.shape[-1])
+        return np.linalg.inv(normal + least.astype(np.float32))
+
+
+def _beyond(count: int, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Which of `count` lenslets stands at each of `size` places from PAD before the first on, and
+    whether it is mirrored there.
+    """
+    place = np.arange(-PAD, size - PAD) % (2 * count)
+    turned = place >= count
+    return np.where(turned, 2 * count - 1 - place, place), turned
 
 
 def _stencil(gram: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

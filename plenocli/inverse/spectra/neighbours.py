@@ -16,6 +16,7 @@ from plenocli.forward.camera.geometry import finely_sampled, geometry
 from plenocli.forward.camera.pupil import polarised
 from plenocli.forward.propagation.response import uniform_response, valid_for
 from plenocli.inverse.registration.smooth_response import DEGREE
+from plenocli.inverse.spectra.field_modes import FieldModes, field_modes
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -24,8 +25,8 @@ if TYPE_CHECKING:
     from plenocli.forward.propagation.plan import PifPlan
     from plenocli.inverse.calibration.calibration import Calibration
 
-POINTS = 3
-"""Object points of a lenslet's field, a side."""
+POINTS = 12
+"""Object points of a lenslet's field, a side, that light is told apart of."""
 REACH = 5
 """Superpixels a side that light of a lenslet is followed to."""
 LEAST_SHARE = 1e-4
@@ -57,15 +58,17 @@ class NeighbourLight:
     an even object of radiance 1 in a band gives F, summed over superpixels and points.
 
     offsets: (superpixel, 2), rows and columns from the lenslet's own, which is among them.
-    light: (superpixel, pixel, point, band), points of the field row by row.
-    changes: (change, superpixel, pixel, point, band), what may be wrong with it, by one standard
+    light: (superpixel, pixel, mode, band).
+    changes: (change, superpixel, pixel, mode, band), what may be wrong with it, by one standard
         deviation.
+    modes: of the points of the field.
     camera: whose light it is.
     """
 
     offsets: np.ndarray
     light: np.ndarray
     changes: np.ndarray
+    modes: FieldModes
     camera: Camera
 
     @property
@@ -89,7 +92,7 @@ class NeighbourLight:
         fitted = self.camera.fitted
         row, column = (np.zeros(2) if fitted is None else np.array(fitted.pixel_shift)) - shift
         there = self.camera.with_fit((float(row), float(column)), 0.0)
-        offsets, light = _predicted(there, calibration)
+        offsets, light = _predicted(there, calibration, self.modes)
         kept = (offsets[:, None] == self.offsets).all(axis=-1).any(axis=1)
         offsets, light = offsets[kept], light[kept]
         changes = np.concatenate([_sizes(offsets, light), self.changes[RINGS:]])
@@ -102,11 +105,15 @@ class NeighbourLight:
 
         Returns (superpixel, pixel, band).
         """
-        return self._kept(self.light.sum(axis=2), np.nan_to_num(response))
+        return self._kept(self._even(self.light), np.nan_to_num(response))
 
     def coupled_changes(self) -> np.ndarray:
         """What `changes` do to `coupled`: (change, superpixel, pixel, band)."""
-        return np.stack([self._kept(change.sum(axis=2), 0.0) for change in self.changes])
+        return np.stack([self._kept(self._even(change), 0.0) for change in self.changes])
+
+    def _even(self, light: np.ndarray) -> np.ndarray:
+        """(superpixel, pixel, band) of fields that are 1."""
+        return np.einsum("opmk,m->opk", light, self.modes.even)
 
     def _kept(self, blocks: np.ndarray, total: np.ndarray | float) -> np.ndarray:
         """Blocks whose sum is `total` by what the own one has."""
@@ -115,10 +122,10 @@ class NeighbourLight:
         return blocks
 
     def fine(self, response: np.ndarray) -> np.ndarray:
-        """As `coupled` for each object point: (superpixel, pixel, point, band), whose sum over
-        superpixels and points is F where the prediction is within a factor of two of it.
+        """As `coupled` for each mode: (superpixel, pixel, mode, band), of which even fields make F
+        where the prediction is within a factor of two of it.
         """
-        f, total = np.nan_to_num(response), self.light.sum(axis=(0, 2))
+        f, total = np.nan_to_num(response), self._even(self.light).sum(axis=0)
         lit = total > DIM * total.max(axis=0)
         scale = np.where(lit, f / np.where(lit, total, 1), 1)
         return self.light * np.clip(scale, *SCALES)[:, None]
@@ -141,8 +148,8 @@ def neighbour_light(camera: Camera, calibration: Calibration) -> NeighbourLight:
     seconds = 3 * sum(seconds_here(plan.chosen) for *_, plan in _planned(camera, calibration))
     if seconds > LONG:
         note(f"neighbours' light is predicted first, in about {duration(seconds)} on one core")
-    offsets, light = _predicted(camera, calibration)
-    total = light.sum(axis=(0, 2))
+    offsets, points = _predicted(camera, calibration)
+    total = points.sum(axis=(0, 2), dtype=float)
     measured, apart = np.nan_to_num(measured), np.nan_to_num(measured - total)
     apart = np.linalg.norm(apart) / np.linalg.norm(measured)
     if not apart < UNLIKE:
@@ -151,14 +158,19 @@ def neighbour_light(camera: Camera, calibration: Calibration) -> NeighbourLight:
             "camera",
             "give the description of the camera that was calibrated",
         )
-    optics = [_predicted(_other_optics(camera, one), calibration)[1] - light for one in np.eye(2)]
+    share = points.sum(axis=(1, 2)) / points.sum(axis=(0, 1, 2))
+    modes = field_modes(points)
+    light = np.moveaxis(np.tensordot(points, modes.basis, (2, 0)), -1, 2)
+    optics = [
+        _predicted(_other_optics(camera, one), calibration, modes)[1] - light for one in np.eye(2)
+    ]
     changes = np.concatenate([_sizes(offsets, light), optics])
-    share = light.sum(axis=(1, 2)) / light.sum(axis=(0, 1, 2))
     kept = (share.max(axis=1) >= LEAST_SHARE) | (offsets == 0).all(axis=1)
     return NeighbourLight(
         offsets=offsets[kept],
         light=light[kept],
         changes=changes[:, kept],
+        modes=modes,
         camera=camera,
     )
 
@@ -195,10 +207,13 @@ def _as_measured(camera: Camera, calibration: Calibration) -> Camera:
     return _other_optics(camera, found.x)
 
 
-def _predicted(camera: Camera, calibration: Calibration) -> tuple[np.ndarray, np.ndarray]:
+def _predicted(
+    camera: Camera, calibration: Calibration, modes: FieldModes | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """(offsets, light) of NeighbourLight for all superpixels that are followed, as bright in each
     band as the calibrated response: by as many object points as a field has diffraction cells,
-    since fewer leave fringes, and too little light on neighbours.
+    since fewer leave fringes, and too little light on neighbours. Of the points of a field, row by
+    row, where there are no modes.
     """
     from plenocli.forward.propagation.system_matrix import PifBuilder
 
@@ -207,10 +222,13 @@ def _predicted(camera: Camera, calibration: Calibration) -> tuple[np.ndarray, np
     for wavelength, sampled, plan in _planned(camera, calibration):
         builder = PifBuilder(sampled, wavelength, plan)
         offsets = builder.offsets
-        bands.append(_thirds(builder.whole(), sampled))
-    light = np.stack(bands, axis=-1) * _colours(camera, calibration)[:, None]
-    known = np.where(np.isfinite(measured), light.sum(axis=(0, 2)), 0).sum(axis=0)
-    return offsets, light * (np.nansum(measured, axis=0) / np.maximum(known, 1e-300))
+        found = _by_part(builder.whole(), sampled)
+        bands.append((found if modes is None else found @ modes.basis).astype(np.float32))
+    light = np.stack(bands, axis=-1) * _colours(camera, calibration)[:, None].astype(np.float32)
+    even = np.ones(POINTS**2) if modes is None else modes.even
+    known = np.einsum("opmk,m,pk->k", light, even, np.isfinite(measured))
+    light *= np.nansum(measured, axis=0) / np.maximum(known, 1e-300)
+    return offsets, light
 
 
 def _planned(camera: Camera, calibration: Calibration) -> Iterator[tuple[float, Camera, PifPlan]]:
@@ -220,7 +238,7 @@ def _planned(camera: Camera, calibration: Calibration) -> Iterator[tuple[float, 
     from plenocli.forward.accuracy.dial import plan_pif
 
     for wavelength, seen in _by_band(camera, calibration):
-        sampled = _in_thirds(finely_sampled(seen, wavelength))
+        sampled = _in_parts(finely_sampled(seen, wavelength))
         settings: Any = {"superpixels": (REACH, REACH), "accuracy": KNOWN_TO}
         yield wavelength, sampled, plan_pif(sampled, wavelengths=(wavelength,), **settings)
 
@@ -352,13 +370,13 @@ def _check(camera: Camera, calibration: Calibration) -> None:
         )
 
 
-def _in_thirds(camera: Camera) -> Camera:
+def _in_parts(camera: Camera) -> Camera:
     """The camera with a number of object points that divides into POINTS a side."""
     samples = tuple(math.ceil(n / POINTS) * POINTS for n in camera.object.samples_per_lenslet)
     return camera.replace(**{"object.samples_per_lenslet": samples})
 
 
-def _thirds(matrix: np.ndarray, camera: Camera) -> np.ndarray:
+def _by_part(matrix: np.ndarray, camera: Camera) -> np.ndarray:
     """(superpixel, pixel, point) of POINTS x POINTS points, each the sum over its part."""
     rows, columns = (n // POINTS for n in camera.object.samples_per_lenslet)
     parts = matrix.reshape(*matrix.shape[:2], POINTS, rows, POINTS, columns)

@@ -18,7 +18,7 @@ from plenocli.forward.sensor.exposure import ExposureOptions, StoredMatrix, simu
 from plenocli.inverse.calibration.measure import NarrowBands, calibrate
 from plenocli.inverse.spectra.crosstalk import METHODS, Crosstalk, windows_of
 from plenocli.inverse.spectra.demultiplexer import Demultiplexer
-from plenocli.inverse.spectra.neighbours import neighbour_light
+from plenocli.inverse.spectra.neighbours import POINTS, neighbour_light
 from plenocli.inverse.spectra.radiance import readout
 from plenocli.inverse.spectra.responses import LensletResponses
 
@@ -151,13 +151,17 @@ def test_edges_inside_fields_are_told(bench, solve):
 
 
 def test_neighbours_light_comes_from_their_near_edges(bench):
-    """Of the 3 x 3 points of a field, whatever order the prediction works them out in."""
+    """Of parts of a field, whatever order the prediction works its points out in."""
     camera, calibration, _, _ = bench
     found = neighbour_light(camera, calibration)
     for step in ((-1, 0), (1, 0), (0, -1), (0, 1)):
         which = np.flatnonzero((found.offsets == step).all(axis=1))[0]
-        points = found.light[which].sum(axis=0).reshape(3, 3, -1)
-        lines = points.sum(axis=1 if step[0] else 0)[:: sum(step)]
+        modes, light = found.modes, found.light[which].sum(axis=0)
+        across = modes.kept[:, 1 if step[0] else 0] == 0
+        along = modes.kept[across, 0 if step[0] else 1]
+        weights = modes.weights[along] * modes.weights[0].sum()
+        # what the points of a line tell of the modes, by what neighbours see of these
+        lines = (weights.T @ light[across]).reshape(3, POINTS // 3, -1).sum(axis=1)[:: sum(step)]
         assert (lines[-1] > 5 * lines[1]).all() and (lines[-1] > 5 * lines[0]).all()
 
 

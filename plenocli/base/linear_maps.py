@@ -21,6 +21,8 @@ from plenocli.base.device import CPU, Device, namespace
 
 CHUNK = 1 << 25
 """Bytes of kernels that are transformed at a time."""
+CACHED = 4
+"""Frequencies whose matrices are multiplied while they are in the processor's cache."""
 
 
 @dataclass(frozen=True)
@@ -235,6 +237,28 @@ class BlockCirculant:
     def back_at_frequencies(self, y: Any) -> Any:
         """(frequency, pixel) -> (frequency, unknown): A_k^H y_k."""
         return times_adjoint(self._there, y)
+
+    def step_at_frequencies(self, inverse: Any, y: Any, pull: Any) -> tuple[Any, Any]:
+        """x_k = inverse_k (A_k^H y_k + pull_k) and A_k x_k; on the processor a few frequencies at
+        a time, so that their matrices are read from memory once.
+
+        inverse: (frequency, unknown, unknown); y: (frequency, pixel); pull: (frequency, unknown).
+        """
+        matrices = self._there
+        if not isinstance(matrices, np.ndarray):
+            x = times(inverse, times_adjoint(matrices, y) + pull)
+            return x, times(matrices, x)
+        x, light = np.empty_like(pull), np.empty_like(y)
+
+        def work(share: slice) -> None:
+            for low in range(share.start, min(share.stop, len(x)), CACHED):
+                part = slice(low, min(low + CACHED, share.stop))
+                back = np.matmul(y[part, None, :].conj(), matrices[part])[:, 0].conj() + pull[part]
+                np.matmul(inverse[part], back[:, :, None], out=x[part, :, None])
+                np.matmul(matrices[part], x[part, :, None], out=light[part, :, None])
+
+        spread(_shares(len(x)), work)
+        return x, light
 
 
 def _transforms(array: Any) -> Any:

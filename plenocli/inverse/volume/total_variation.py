@@ -24,8 +24,6 @@ ROUNDS, LAST = 10, 36
 """At each strength, and more of them at the best, in which surfaces are free to be steep."""
 LOOKED_AT = 12
 """Rounds after which it is looked again at where surfaces are."""
-STEEPER = 2.0
-"""Strength along surfaces, over that which was chosen for all directions."""
 BLUR, ABOUT = 1.0, 1.5
 """Pitches of voxels over which a volume is smoothed, and about a voxel, to see surfaces."""
 GAIN = 0.01
@@ -64,7 +62,7 @@ def total_variation(
         state, least, chosen = tried, misfit, strength
     for done in range(0, rounds, LOOKED_AT):
         seen = descent.surfaces(state)
-        state = descent.rounds(state, STEEPER * chosen, min(LOOKED_AT, rounds - done), seen)
+        state = descent.rounds(state, chosen, min(LOOKED_AT, rounds - done), seen)
     trace.append(Trial(f"strength {chosen:g}, to the end", problem.misfit(state.light)))
     return Volume(
         value=problem.inside(problem.voxels.lenslets(state.u)),
@@ -203,8 +201,8 @@ class Surfaces:
     """Where a volume looks like a surface, and which way it faces.
 
     normal: (plane, row, column differences), each (plane, row, column), of length 1.
-    free: (plane, row, column) 1 where the volume changes along the normal alone, 0 where it
-        changes as much along another direction.
+    free: (plane, row, column) 1 where the volume changes along the normal alone, 0 where half as
+        much of the change, or more, is along another direction.
     """
 
     normal: tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -232,7 +230,7 @@ def surfaces_of(x: np.ndarray, along: np.ndarray, down: float) -> Surfaces:
         tensor[..., i, j] = tensor[..., j, i] = mean
     values, vectors = np.linalg.eigh(tensor)
     least = np.finfo(x.dtype).tiny
-    free = 1 - np.maximum(values[..., 1], 0) / np.maximum(values[..., 2], least)
+    free = np.maximum(1 - 2 * np.maximum(values[..., 1], 0) / np.maximum(values[..., 2], least), 0)
     normal = np.ascontiguousarray(np.moveaxis(vectors[..., 2], -1, 0))
     return Surfaces((normal[0], normal[1], normal[2]), free)
 
@@ -240,22 +238,24 @@ def surfaces_of(x: np.ndarray, along: np.ndarray, down: float) -> Surfaces:
 def shrunk(
     v: tuple[np.ndarray, ...], by: np.floating, surfaces: Surfaces | None = None
 ) -> tuple[np.ndarray, ...]:
-    """Differences whose length at every voxel is shorter by `by`; with surfaces, that along them,
-    and what is across them by as much less as they are free.
+    """Differences whose length at every voxel is shorter by `by`.
+
+    As far as a surface is free that across it is instead shorter by less, down to nothing, and
+    that along it by more, up to twice: the mean of both, which belongs to a convex measure of
+    differences again (the proximal average; Bauschke, Goebel, Lucet and Wang 2008).
     """
     deep, down, right = v
+    square = down**2 + right**2
+    square[:-1] += deep**2
+    left = _left(np.sqrt(square), by)
     if surfaces is None:
-        square = down**2 + right**2
-        square[:-1] += deep**2
-        left = _left(np.sqrt(square), by)
         return deep * left[:-1], down * left, right * left
-    normal = surfaces.normal
+    normal, free = surfaces.normal, surfaces.free
     across = normal[1] * down + normal[2] * right
     across[:-1] += normal[0][:-1] * deep
-    square = down**2 + right**2 - across**2
-    square[:-1] += deep**2
-    left = _left(np.sqrt(np.maximum(square, 0)), by)
-    more = across * (_left(np.abs(across), by * (1 - surfaces.free)) - left)
+    along = _left(np.sqrt(np.maximum(square - across**2, 0)), by * (1 + free))
+    more = free * across * (_left(np.abs(across), by * (1 - free)) - along)
+    left += free * (along - left)
     deep, down, right = deep * left[:-1], down * left, right * left
     return deep + (normal[0] * more)[:-1], down + normal[1] * more, right + normal[2] * more
 

@@ -8,9 +8,11 @@ from plenocli.base.errors import NumericsError
 from plenocli.base.linear_maps import BlockCirculant
 from plenocli.inverse.volume.measurement import Measurement, Problem, Voxels
 from plenocli.inverse.volume.total_variation import (
+    Surfaces,
     back_differences,
     differences,
     shrunk,
+    surfaces_of,
     total_variation,
 )
 from tests.reference import volumes
@@ -59,6 +61,12 @@ def lengths(v):
     return np.sqrt(square)
 
 
+def isotropic(monkeypatch):
+    """No surfaces are seen: the problem is that of the primal-dual solver."""
+    nowhere = lambda x, along, down: Surfaces((x, x, x), np.zeros_like(x))  # noqa: E731
+    monkeypatch.setattr("plenocli.inverse.volume.total_variation.surfaces_of", nowhere)
+
+
 def cost(x, a, y, weight, steps):
     return 0.5 * np.sum((a @ x - y) ** 2) + weight * lengths([d @ x for d in steps]).sum()
 
@@ -83,7 +91,8 @@ def primal_dual(a, y, weight, steps, rounds=5000):
 
 
 @pytest.mark.parametrize("strength", [0.02, 0.2])
-def test_it_is_the_least(strength):
+def test_it_is_the_least(strength, monkeypatch):
+    isotropic(monkeypatch)
     problem, _ = box()
     volume = total_variation(problem, (strength,), 600)
     terms = (*dense_terms(problem, strength), gradients())
@@ -108,6 +117,65 @@ def test_shrinking_takes_the_same_length_off_everywhere():
     v = differences(np.random.default_rng(2).standard_normal((3, 6, 8)), np.ones(2))
     before, after = lengths(v), lengths(shrunk(v, np.float64(0.5)))
     np.testing.assert_allclose(after, np.maximum(before - 0.5, 0), atol=1e-12)
+
+
+def test_across_a_surface_less_is_taken_off_and_along_it_more():
+    """Against vectors turned so that the first axis is the normal, one voxel at a time."""
+    rng = np.random.default_rng(3)
+    v = differences(rng.standard_normal((3, 6, 8)), np.ones(2))
+    normal = rng.standard_normal((3, 3, 6, 8))
+    normal /= np.linalg.norm(normal, axis=0)
+    free = rng.choice([0, 0.4, 1], (3, 6, 8))
+    found = shrunk(v, np.float64(0.5), Surfaces(tuple(normal), free))
+    for place in np.ndindex(2, 6, 8):
+        vector, n, f = np.array([part[place] for part in v]), normal[(..., *place)], free[place]
+        frame = np.linalg.svd(n[None])[2]
+        across, *along = frame @ vector
+        across *= max(1 - 0.5 * (1 - f) / abs(across), 0)
+        along = np.array(along) * max(1 - 0.5 * (1 + f) / np.linalg.norm(along), 0)
+        even = vector * max(1 - 0.5 / np.linalg.norm(vector), 0)
+        expected = f * (frame.T @ [across, *along]) + (1 - f) * even
+        np.testing.assert_allclose([part[place] for part in found], expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("spacing", [1.0, 2.0])
+def test_surfaces_are_where_a_volume_changes_one_way(spacing):
+    """An edge aslant has its own normal and is free, a bead is not; planes may lie further apart
+    than voxels.
+    """
+    deep, down, right = np.indices((15, 24, 24)) - np.array([7, 12, 12])[:, None, None, None]
+    deep = deep * spacing
+    normal = np.array([0.4, 0.6, np.sqrt(1 - 0.52)])
+    along, middle = np.full(14, 1 / spacing), (slice(5, 10), slice(9, 16), slice(9, 16))
+    edge = np.tanh(normal[0] * deep + normal[1] * down + normal[2] * right)
+    seen = surfaces_of(edge, along, 1.0)
+    cosine = np.abs(np.tensordot(normal, np.array(seen.normal), 1))[middle]
+    assert cosine.min() > 0.98 and seen.free[middle].min() > 0.9
+    bead = np.exp(-(deep**2 + down**2 + right**2) / 8)
+    assert surfaces_of(bead, along, 1.0).free[7, 12, 12] < 0.3
+
+
+def test_a_sheet_aslant_is_found_better(monkeypatch):
+    """A sheet through both planes, with and without surfaces."""
+    rng = np.random.default_rng(5)
+    parts = [(b, o) for b, o in volumes.kernels(2, 4, 25)]
+    op = BlockCirculant(parts, (8, 8), (10, 10))
+    down, right = np.indices((20, 20))
+    sheet = np.abs(0.6 * down + 0.8 * right - 14) < 3
+    truth = np.array([sheet, np.roll(sheet, 2, axis=1)], float)
+    light = op.forward(VOXELS.lenslets(truth))
+    measurement = Measurement(
+        signal=light + 0.05 * rng.standard_normal(light.shape), read_variance=0.0025
+    )
+    problem = Problem(op, measurement, VOXELS, hold_out=0.1)
+
+    def error():
+        found = total_variation(problem).value
+        return np.linalg.norm(found - truth[:, :16, :16])
+
+    steep = error()
+    isotropic(monkeypatch)
+    assert steep < 0.96 * error()
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])

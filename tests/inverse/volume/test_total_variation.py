@@ -63,7 +63,7 @@ def lengths(v):
 
 def isotropic(monkeypatch):
     """No surfaces are seen: the problem is that of the primal-dual solver."""
-    nowhere = lambda x, along, down: Surfaces((x, x, x), np.zeros_like(x))  # noqa: E731
+    nowhere = lambda x, along, down: Surfaces((x, x, x), np.zeros_like(x))
     monkeypatch.setattr("plenocli.inverse.volume.total_variation.surfaces_of", nowhere)
 
 

@@ -109,7 +109,9 @@ class Crosstalk:
             biases[other] = guess.value - np.moveaxis(answer.value, -1, 0)
             error[other] = float(np.nanmean(guess.sigma**2 + biases[other] ** 2))
         used = min(error, key=lambda one: error[one])
-        why = "predicted rms error " + ", ".join(f"{m} {np.sqrt(e):.3g}" for m, e in error.items())
+        why = "predicted rms error of radiance " + ", ".join(
+            f"{m} {np.sqrt(e):.3g}" for m, e in error.items()
+        )
         if used == name:
             return self._told(answer, "auto", name, why)
         found = self._alone(self.values, used)

@@ -345,7 +345,7 @@ class _Estimation:
         error["single-pixel"] = self._single_pixel_error(self._radiance(sums, self.sample))
         least = min(error.values())
         used = next(m for m in error if error[m] <= WORTHWHILE * least)
-        return used, "predicted rms error " + ", ".join(
+        return used, "predicted rms error of radiance " + ", ".join(
             f"{m} {np.sqrt(e):.3g}" for m, e in error.items()
         )
 

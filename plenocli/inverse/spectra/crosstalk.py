@@ -99,7 +99,8 @@ class Crosstalk:
         many = self.first if method == "coupled" else fine(self.capture, self.first, self.light)
         if method in METHODS:
             return self._told(many, method, method, "asked for")
-        finer = more_likely(self.capture, self.first, many)
+        # fine makes patterns of a field of what is wrong with F, most where it is predicted
+        finer = not self.c.predicted and more_likely(self.capture, self.first, many)
         name, answer = ("fine", many) if finer else ("coupled", self.first)
         error = {name: float(np.nanmean(answer.sigma[self.c.valid] ** 2))}
         biases = {}

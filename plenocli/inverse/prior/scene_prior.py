@@ -105,7 +105,7 @@ class ScenePrior:
 
     def heard(self, sigma: float, scene: str | None) -> np.ndarray:
         """Directions of a superpixel, (pixel, k), in which photographs matter at noise `sigma` of
-        a pixel, the loudest last (joint_lmmse.loud_directions).
+        a pixel, the loudest last (joint_lmmse.shown_directions).
         """
         self.lmmse(sigma, scene)  # draws the patches
         covariance, bands = self.statistics[scene][1], self.bands()

@@ -96,12 +96,15 @@ class Crosstalk:
 
     def spectra(self, method: str) -> Spectra:
         """By "coupled", "fine" or the best of all, "auto"."""
-        many = self.first if method == "coupled" else fine(self.capture, self.first, self.light)
-        if method in METHODS:
-            return self._told(many, method, method, "asked for")
         # fine makes patterns of a field of what is wrong with F, most where it is predicted
-        finer = not self.c.predicted and more_likely(self.capture, self.first, many)
-        name, answer = ("fine", many) if finer else ("coupled", self.first)
+        if method == "coupled" or (method == "auto" and self.c.predicted):
+            name, answer = "coupled", self.first
+        else:
+            name, answer = "fine", fine(self.capture, self.first, self.light)
+        if method in METHODS:
+            return self._told(answer, method, method, "asked for")
+        if name == "fine" and not more_likely(self.capture, self.first, answer):
+            name, answer = "coupled", self.first
         error = {name: float(np.nanmean(answer.sigma[self.c.valid] ** 2))}
         biases = {}
         # wls and lmmse lean on dark pixels, where neighbours' light lies: pinv in all of 40 cases

@@ -145,8 +145,9 @@ def _exposed(
         missing = store.missing(camera, source.wavelengths, options)
         planned = planned_accuracy(camera, options, source.wavelengths, missing)
         matrices, accuracy = None, planned.as_json()
-    _tell_of_the_field(AccuracyRecord.from_json(accuracy))
-    if options.model != "ray":
+    record = AccuracyRecord.from_json(accuracy)
+    _tell_of_the_field(record)
+    if record.model != "ray":
         _tell_of_the_points(camera, options.refine)
     found = simulate_capture(
         camera,

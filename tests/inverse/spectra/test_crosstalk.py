@@ -150,6 +150,15 @@ def test_edges_inside_fields_are_told(bench, solve):
     assert errors(found["auto"], scene.truth())[1] < 1.6
 
 
+def test_fine_is_left_out_where_the_response_is_predicted(bench):
+    camera, calibration, _, shoot = bench
+    shot = shoot(Mosaic(camera.light.wavelengths, 6, offset=0.4), seed=8)
+    response = replace(calibration.response, notes={"source": "predicted"})
+    for one, taken in ((response, "coupled"), (calibration.response, "fine")):
+        solver = Demultiplexer(replace(calibration, response=one), camera=camera)
+        assert solver.estimate(shot, "x").method == taken
+
+
 def test_neighbours_light_comes_from_their_near_edges(bench):
     """Of parts of a field, whatever order the prediction works its points out in."""
     camera, calibration, _, _ = bench

@@ -147,7 +147,7 @@ def _exposed(
         matrices, accuracy = None, planned.as_json()
     record = AccuracyRecord.from_json(accuracy)
     _tell_of_the_field(record)
-    if record.model != "ray":
+    if record is None or record.model != "ray":
         _tell_of_the_points(camera, options.refine)
     found = simulate_capture(
         camera,

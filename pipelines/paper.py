@@ -409,7 +409,7 @@ def _reconstructed(run):
     nnls = dict(sorted(nnls.items()))
     names = [f"nnls-{max(nnls)}", "lmmse", "unlearned", "dictionary", "lmmse-3x3", "pnp"]
     results = [read_result(run / "paper" / f"{n}.h5") for n in names]
-    true, block = read_truth(truth, results[0]), read_block(results[0], truth)
+    true, block = read_truth(truth, results[0]).window(), read_block(results[0], truth)
     entries = [(n, r.values, f"{scores[n]:.2f} dB") for n, r in zip(names, results, strict=True)]
     steps = {n: _blocking(r.values, true, block) for n, r in zip(names, results, strict=True)}
     learnt, doll = scores["dictionary"], run.name == "doll"

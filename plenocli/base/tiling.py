@@ -5,11 +5,16 @@ memory.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
+
+BAND, LEAST = 1 << 18, 16
+"""Points of a band of a Plane, about, and its rows at least."""
 
 
 def to_blocks(plane: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
@@ -91,6 +96,49 @@ class InParts:
     def whole(self) -> np.ndarray:
         """All of it, in memory."""
         return np.concatenate(list(self.parts())).reshape(self.shape).astype(self.dtype, copy=False)
+
+
+EVERYTHING = slice(None)
+
+
+@dataclass(frozen=True)
+class Plane:
+    """A picture that is read in windows, because it may not fit the memory.
+
+    shape: of all of it, (..., row, column).
+    read: gives a window by its rows and columns, slices without a step.
+    """
+
+    shape: tuple[int, ...]
+    read: Callable[[slice, slice], np.ndarray]
+
+    @classmethod
+    def of(cls, values: ArrayLike | Plane) -> Plane:
+        """That of an array; a Plane is one already."""
+        if isinstance(values, Plane):
+            return values
+        array = np.asarray(values)
+        return cls(array.shape, lambda rows, columns: array[..., rows, columns])
+
+    def window(self, rows: slice = EVERYTHING, columns: slice = EVERYTHING) -> np.ndarray:
+        """A part of the last two axes, float64."""
+        return np.asarray(self.read(rows, columns), dtype=np.float64)
+
+    def through(self, change: Callable[[np.ndarray], np.ndarray]) -> Plane:
+        """The plane of what `change`, which works point by point, makes of windows."""
+        return Plane(self.shape, lambda rows, columns: change(self.window(rows, columns)))
+
+    def in_bands(self, multiple: int = 1) -> list[slice]:
+        """Rows of bands that are worked on one after the other.
+
+        multiple: whole numbers of so many rows; the last band may have less.
+        """
+        points = math.prod(self.shape) // max(self.shape[-2], 1)
+        most = max(BAND // max(points, 1), LEAST) // multiple * multiple
+        found = bands(self.shape[-2], max(most, multiple))
+        if len(found) > 1 and found[-1].stop - found[-1].start < LEAST:
+            found[-2:] = [slice(found[-2].start, found[-1].stop)]
+        return found
 
 
 def bands(count: int, most: int) -> list[slice]:

@@ -2,9 +2,12 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+
+from plenocli.base.tiling import Plane
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,10 +30,11 @@ class Result:
 
     path: its file.
     kind: "image", "spectra" or "dictionary".
-    values: (row, column) or (band, row, column) float64; atoms (point, atom) of a dictionary.
+    plane: (row, column) or (band, row, column), which may still be in the file; atoms (point, atom)
+        of a dictionary.
     wavelengths: (band,) m, None for a single picture.
-    sigma: like values, or None.
-    s1: like values, what is polarised of spectra (plenocli.inverse.spectra.spectra), or None.
+    deviation: like plane, or None.
+    s1: like plane, what is polarised of spectra (plenocli.inverse.spectra.spectra), or None.
     quantity: "radiance", "reflectance", or "" for pictures.
     method: how it was computed, "" where nobody says.
     block: (rows, columns) of object points under a lenslet, where the file says so.
@@ -45,9 +49,9 @@ class Result:
 
     path: Path
     kind: str
-    values: np.ndarray
+    plane: Plane
     wavelengths: np.ndarray | None = None
-    sigma: np.ndarray | None = None
+    deviation: Plane | None = None
     s1: np.ndarray | None = None
     quantity: str = ""
     method: str = ""
@@ -58,6 +62,16 @@ class Result:
     object_shape: tuple[int, ...] | None = None
     rgb: np.ndarray | None = None
     history: Mapping[str, np.ndarray] = field(default_factory=dict)
+
+    @cached_property
+    def values(self) -> np.ndarray:
+        """All of the plane, in memory, float64."""
+        return self.plane.window()
+
+    @cached_property
+    def sigma(self) -> np.ndarray | None:
+        """All of the deviation, in memory, float64."""
+        return None if self.deviation is None else self.deviation.window()
 
     @property
     def name(self) -> str:
@@ -73,8 +87,8 @@ class Result:
 
     @property
     def grid(self) -> tuple[int, int]:
-        """(rows, columns) of the values."""
-        rows, columns = self.values.shape[-2:]
+        """(rows, columns) of the plane."""
+        rows, columns = self.plane.shape[-2:]
         return rows, columns
 
 

@@ -10,9 +10,14 @@ if TYPE_CHECKING:
     from plenocli.files.artefacts.container import Artefact
 
 
+LARGE = ("image/value", "image/sigma", "capture/mosaic", "capture/scene")
+
+
 @dataclass(frozen=True, kw_only=True)
 class OpenedFile:
-    """A file to look at: its kind, and its artefact, verified, where it is one."""
+    """A file to look at: its kind, and its artefact, verified, where it is one, without what may
+    not fit the memory: LARGE.
+    """
 
     path: Path
     kind: str
@@ -33,7 +38,7 @@ def open_file(file: Path | str) -> OpenedFile:
 
     Raises InputError where it is none.
     """
-    from plenocli.files.artefacts.container import read_artefact
+    from plenocli.files.artefacts.container import opened_artefact
     from plenocli.files.artefacts.provenance import require_file
     from plenocli.files.artefacts.shards import PIF_KINDS, read_pif
     from plenocli.files.images.exr import read_exr
@@ -44,7 +49,8 @@ def open_file(file: Path | str) -> OpenedFile:
     path = Path(file)
     require_file(path)
     if is_hdf5(path):
-        artefact = read_artefact(path)
+        with opened_artefact(path, None, LARGE) as (artefact, _):
+            pass
         if artefact.kind != "pif" and artefact.kind in PIF_KINDS:
             return OpenedFile(path=path, kind="pif", artefact=read_pif(path))
         return OpenedFile(path=path, kind=artefact.kind, artefact=artefact)

@@ -3,8 +3,10 @@ back as PNG bytes.
 """
 
 import io
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -12,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from plenocli.base.errors import UsageError
 from plenocli.base.text import how_to_install, printable_lines
+from plenocli.base.tiling import Plane
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -31,6 +34,10 @@ LEVEL_MAP = "viridis"  # other positive quantities
 SIGN_MAP = "RdBu_r"  # differences, white is none
 GRID_LINE = "#56B4E9"
 DPI = 130
+THUMB = 1100
+"""Points of a side beyond which a picture is drawn from averages over blocks."""
+_SAMPLE = 1 << 20
+"""Values of a picture that its statistics need at most."""
 
 _STYLE: dict[Any, Any] = {
     "font.family": "DejaVu Sans",
@@ -182,7 +189,7 @@ def bare(axes: "Axes", title: str = "") -> None:
         axes.set_title(title)
 
 
-def thumbnail(values: np.ndarray, limit: int = 1100) -> tuple[np.ndarray, int]:
+def thumbnail(values: "ArrayLike | Plane", limit: int = THUMB) -> tuple[np.ndarray, int]:
     """A picture averaged over whole blocks.
 
     values: (row, column).
@@ -190,13 +197,43 @@ def thumbnail(values: np.ndarray, limit: int = 1100) -> tuple[np.ndarray, int]:
 
     Returns (picture, side of a block).
     """
+    made = overview(values, limit)
+    return made.small, made.step
+
+
+@dataclass(frozen=True, kw_only=True)
+class Overview:
+    """A picture that may not fit the memory, seen once from the first row to the last.
+
+    small: (..., row, column) averaged over blocks of `step` x `step` points.
+    sample: its values for statistics, (n,), all of them or those of an even grid.
+    """
+
+    small: np.ndarray
+    step: int
+    sample: np.ndarray
+
+
+def overview(values: "ArrayLike | Plane", limit: int = THUMB) -> Overview:
+    """The Overview of a picture (..., row, column); `limit`: of either side of what is small."""
     from plenocli.forward.scene.sample import block_mean
 
-    step = max(1, -(-max(values.shape) // limit))
-    rows, cols = (n // step * step for n in values.shape)
-    if step == 1 or not rows or not cols:
-        return values, 1
-    return block_mean(values[:rows, :cols], (step, step)), step
+    plane = Plane.of(values)
+    step = max(1, -(-max(plane.shape[-2:]) // limit))
+    rows, columns = (n // step * step for n in plane.shape[-2:])
+    step = step if rows and columns else 1
+    every = math.ceil((math.prod(plane.shape) / _SAMPLE) ** 0.5)
+    small, sample = [], []
+    for part in plane.in_bands(math.lcm(step, every)):
+        band = plane.window(part)
+        sample.append(band[..., ::every, ::every].copy())
+        whole = band[..., : max(rows - part.start, 0), :columns]
+        if step == 1:
+            small.append(band)
+        elif whole.size:
+            small.append(block_mean(whole, (step, step)))
+    joined = (np.concatenate(parts, axis=-2) for parts in (small, sample))
+    return Overview(small=next(joined), step=step, sample=next(joined).reshape(-1))
 
 
 def nanometres(wavelength: float) -> str:

@@ -7,30 +7,38 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from plenocli.base.tiling import Plane
 from plenocli.evaluation.results import Result
 from plenocli.files.results.matrices import StoredMatrix
-from plenocli.report.drawing import Figures
+from plenocli.report.drawing import Figures, overview
 
 if TYPE_CHECKING:
+    from plenocli.files.images.mosaic import StoredCapture
     from plenocli.forward.sensor.capture import Capture
     from plenocli.inverse.calibration.calibration import Calibration, Response
 
 Place = tuple[int, int]
 
 
-def capture_figures(capture: "Capture", name: str, centres: np.ndarray | None = None) -> Figures:
+def capture_figures(
+    capture: "Capture",
+    name: str,
+    centres: np.ndarray | None = None,
+    source: "StoredCapture | None" = None,
+) -> Figures:
     """A capture with its lenslet grid.
 
     capture: of any target.
     name: for the caption.
     centres: (lenslet_row, lenslet_column, 2) px, else the superpixels it tells of.
+    source: the same where its mosaic stays in the file, which `capture` then lacks.
     """
-    from plenocli.forward.sensor.cfa import preview
+    from plenocli.forward.sensor.cfa import colour_planes, preview
     from plenocli.report.pictures import capture_picture
 
-    shape = capture.grid.shape if capture.grid else None
+    tile = capture.grid.shape if capture.grid else None
     pitch = (
-        tuple(float(n) for n in np.ravel(shape)) if centres is None and shape is not None else None
+        tuple(float(n) for n in np.ravel(tile)) if centres is None and tile is not None else None
     )
     words = [
         name,
@@ -39,15 +47,25 @@ def capture_figures(capture: "Capture", name: str, centres: np.ndarray | None = 
         None if not capture.exposure_s else f"exposure {capture.exposure_s * 1e3:g} ms",
         None if not capture.metadata.band_m else f"{capture.metadata.band_m * 1e9:g} nm light",
     ]
+    window = capture.window if source is None else source.window
+    shape = capture.shape if source is None else source.shape
+
+    def colours(rows: slice, columns: slice) -> np.ndarray:
+        ends = (part.indices(side // 2)[:2] for part, side in zip((rows, columns), shape))
+        signal = window(*(slice(2 * first, 2 * last) for first, last in ends)).signal()
+        return colour_planes(np.nan_to_num(signal), capture.cfa)
+
+    colour = None
+    if capture.cfa != "mono" and min(shape) >= 2:
+        seen = overview(Plane((3, *(side // 2 for side in shape)), colours))
+        colour = (preview(seen.small, capture.profile), 2 * seen.step)
     picture = capture_picture(
-        capture.mosaic,
+        Plane(shape, lambda rows, columns: window(rows, columns).mosaic),
         capture.units,
         centres,
         pitch,
         float(np.mean(capture.levels.black)),
-        None
-        if capture.cfa == "mono" or min(capture.shape) < 2
-        else preview(np.nan_to_num(capture.signal()), capture.cfa, capture.profile),
+        colour,
     )
     return [(picture, ", ".join(str(w) for w in words if w) + ".")]
 
@@ -212,7 +230,7 @@ def image_figures(result: Result, name: str, seen: np.ndarray | None = None) -> 
 
     figures = [
         (
-            picture(result.values if result.rgb is None else np.moveaxis(result.rgb, 0, -1), name),
+            picture(result.plane if result.rgb is None else np.moveaxis(result.rgb, 0, -1), name),
             f"{name}{': ' + result.method if result.method else ''}; no truth to compare with.",
         )
     ]

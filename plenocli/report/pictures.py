@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from plenocli.base.tiling import Plane
 from plenocli.report.drawing import (
     COLOURS,
     GRID_LINE,
@@ -18,6 +19,7 @@ from plenocli.report.drawing import (
     colour_bar,
     drawing,
     nanometres,
+    overview,
     show_map,
     show_picture,
     thumbnail,
@@ -30,7 +32,7 @@ if TYPE_CHECKING:
     from matplotlib.patches import Rectangle
 
 Shape = tuple[int, ...]
-Entry = tuple[str, np.ndarray, str]
+Entry = tuple[str, np.ndarray | Plane, str]
 """Label, values (row, column) and caption of a result."""
 ZOOMED = 3
 """Superpixels per side in the close-up."""
@@ -48,12 +50,12 @@ HISTORY = {
 
 
 def capture_picture(
-    mosaic: np.ndarray,
+    mosaic: np.ndarray | Plane,
     units: str = "",
     centres: np.ndarray | None = None,
     pitch: tuple[float, ...] | None = None,
     black: float = 0.0,
-    colour: np.ndarray | None = None,
+    colour: tuple[np.ndarray, int] | None = None,
 ) -> bytes:
     """A capture: the whole mosaic with its lenslet grid, and the middle superpixels close up.
 
@@ -63,20 +65,25 @@ def capture_picture(
     pitch: (row, column) px or None, used where centres are missing, for superpixels that tile from
         the corner.
     black: level above which values are shown, on one scale for both parts.
-    colour: (row, column, 3) linear sRGB, the same at half the size, which is shown as a whole
-        instead of values; None of grey captures.
+    colour: (row, column, 3) linear sRGB that is shown as a whole instead of values, and the pixels
+        of the sensor along a side of one of its; None of grey captures.
 
     Returns PNG.
     """
-    mosaic = np.asarray(mosaic, dtype=np.float64) - black
-    top = float(np.percentile(mosaic, 99.9)) or 1.0
-    centres = _tiling(mosaic.shape, pitch) if centres is None and pitch is not None else centres
+    from plenocli.forward.scene.colour import encode_srgb
+
+    plane = Plane.of(mosaic).through(lambda values: values - black)
+    seen = overview(plane)
+    top = float(np.percentile(seen.sample, 99.9)) or 1.0
+    centres = _tiling(plane.shape, pitch) if centres is None and pitch is not None else centres
     if centres is not None and not np.isfinite(centres).all(axis=-1).any():
         centres = None
-    rows, cols = mosaic.shape
+    rows, cols = plane.shape
     with drawing(10.2, 4.75) as made:
         whole, close = made.figure.subplots(1, 2)
-        shown, step = thumbnail(mosaic) if colour is None else _smaller(colour)
+        shown, step = seen.small, seen.step
+        if colour is not None:
+            shown, step = encode_srgb(colour[0]), colour[1]
         whole.imshow(
             shown,
             cmap=LIGHT_MAP,
@@ -90,8 +97,8 @@ def capture_picture(
             title=f"{rows} x {cols} pixels"
             + ("" if step == 1 else f", shown {step} times smaller"),
         )
-        box = _middle(mosaic.shape, centres)
-        image = _close_up(close, mosaic, box, top)
+        box = _middle(plane.shape, centres)
+        image = _close_up(close, plane, box, top)
         close.set(
             xlabel="column [px]",
             title="close-up"
@@ -99,28 +106,23 @@ def capture_picture(
             else f"{ZOOMED} x {ZOOMED} superpixels in the middle",
         )
         if centres is not None:
-            _lattice(close, centres, 0.9)
             if centres.shape[0] * centres.shape[1] <= 2500:
                 _lattice(whole, centres, 0.35)
+            else:
+                near = (slice(max(n // 2 - 9, 0), n // 2 + 10) for n in centres.shape[:2])
+                centres = centres[tuple(near)]
+            _lattice(close, centres, 0.9)
         whole.add_patch(_outline(box))
         colour_bar(close, image, f"signal [{units}]" if units else "signal")
     return made.png
 
 
-def _smaller(colour: np.ndarray) -> tuple[np.ndarray, int]:
-    """(a thumbnail as the screen takes it, pixels of the sensor in one of its)."""
-    from plenocli.forward.scene.colour import encode_srgb
-
-    layers = [thumbnail(layer) for layer in np.moveaxis(colour, -1, 0)]
-    return encode_srgb(np.stack([layer for layer, _ in layers], axis=-1)), 2 * layers[0][1]
-
-
 def _close_up(
-    axes: "Axes", mosaic: np.ndarray, box: tuple[int, int, int, int], top: float
+    axes: "Axes", mosaic: Plane, box: tuple[int, int, int, int], top: float
 ) -> "AxesImage":
     """A part of a capture, rows and columns from and to, white at `top`."""
     return axes.imshow(
-        mosaic[box[0] : box[1], box[2] : box[3]],
+        mosaic.window(slice(*box[:2]), slice(*box[2:])),
         cmap=LIGHT_MAP,
         vmin=0,
         vmax=top,
@@ -359,7 +361,7 @@ def matrix_summary(
     return made.png
 
 
-def reconstructions(entries: Sequence[Entry], truth: np.ndarray, columns: int = 4) -> bytes:
+def reconstructions(entries: Sequence[Entry], truth: np.ndarray | Plane, columns: int = 4) -> bytes:
     """Reconstructions beside the truth, each above its error; light encoded for the screen,
     white = 1.
 
@@ -370,34 +372,31 @@ def reconstructions(entries: Sequence[Entry], truth: np.ndarray, columns: int = 
 
     Returns PNG.
     """
-    truth = np.asarray(truth, dtype=np.float64)
-    errors = [np.asarray(values) - truth for _, values, _ in entries]
+    true, seen = overview(truth), [overview(values) for _, values, _ in entries]
+    errors = [one.small - true.small for one in seen]
+    typical = [np.percentile(np.abs(one.sample - true.sample), 98) for one in seen]
     # Methods differ by decades: the scale is that of the typical method and never beyond half of
     # white; poor ones saturate.
-    top = (
-        min(max(float(np.median([np.percentile(np.abs(e), 98) for e in errors])), 1e-6), 0.5)
-        if errors
-        else 1.0
-    )
+    top = min(max(float(np.median(typical)), 1e-6), 0.5) if errors else 1.0
     columns = min(columns, len(entries) + 1)
     lines = -(-(len(entries) + 1) // columns)
     panel = 10.2 / columns
-    aspect = truth.shape[0] / truth.shape[1]
+    aspect = Plane.of(truth).shape[0] / Plane.of(truth).shape[1]
     with drawing(10.2, lines * (2 * panel * aspect + 0.55)) as made:
         panels = made.figure.subplots(2 * lines, columns, squeeze=False)
         for axes in panels.flat:
             axes.set_axis_off()
         panels[0, 0].set_axis_on()
-        show_picture(panels[0, 0], truth, "truth")
+        show_picture(panels[0, 0], true.small, "truth")
         image = None
-        for number, ((label, values, caption), error) in enumerate(
-            zip(entries, errors, strict=True), start=1
+        for number, ((label, _, caption), one, error) in enumerate(
+            zip(entries, seen, errors, strict=True), start=1
         ):
             line, column = divmod(number, columns)
             above, below = panels[2 * line, column], panels[2 * line + 1, column]
             above.set_axis_on()
             below.set_axis_on()
-            show_picture(above, values, f"{label}\n{caption}" if caption else label)
+            show_picture(above, one.small, f"{label}\n{caption}" if caption else label)
             image = below.imshow(error, cmap=SIGN_MAP, vmin=-top, vmax=top)
             bare(below)
         if image is not None:
@@ -415,7 +414,7 @@ def reconstructions(entries: Sequence[Entry], truth: np.ndarray, columns: int = 
 
 def close_ups(
     entries: Sequence[Entry],
-    truth: np.ndarray,
+    truth: np.ndarray | Plane,
     block: tuple[int, int],
     lenslets: int = 3,
     columns: int = 4,
@@ -431,13 +430,12 @@ def close_ups(
     Returns PNG.
     """
     boxes = []
-    for size, side in zip(truth.shape, block, strict=True):
+    for size, side in zip(Plane.of(truth).shape, block, strict=True):
         count = size // side
         first = max((count - lenslets) // 2, 0) * side
         boxes.append(slice(first, min(first + lenslets * side, size)))
-    parts = [("truth", truth[tuple(boxes)])] + [
-        (label, np.asarray(values)[tuple(boxes)]) for label, values, _ in entries
-    ]
+    named = [("truth", truth), *((label, values) for label, values, _ in entries)]
+    parts = [(label, Plane.of(values).window(*boxes)) for label, values in named]
     columns = min(columns, len(parts))
     lines = -(-len(parts) // columns)
     panel = 10.2 / columns
@@ -454,13 +452,19 @@ def close_ups(
     return made.png
 
 
-def picture(values: np.ndarray, title: str = "") -> bytes:
-    """One reconstructed picture (row, column), without truth, as PNG."""
-    values = np.asarray(values, dtype=np.float64)
-    top = float(np.percentile(values, 99.8))
-    height = 5.4 * values.shape[0] / values.shape[1]
+def picture(values: np.ndarray | Plane, title: str = "") -> bytes:
+    """One reconstructed picture (row, column), or in colour (row, column, 3), without truth, as
+    PNG.
+    """
+    if isinstance(values, np.ndarray) and values.ndim == 3:
+        small, sample = values.astype(np.float64), values
+    else:
+        seen = overview(values)
+        small, sample = seen.small, seen.sample
+    top = float(np.percentile(sample, 99.8))
+    height = 5.4 * small.shape[0] / small.shape[1]
     with drawing(5.4, min(height, 9) + 0.3) as made:
-        show_picture(made.figure.subplots(), values / top if top > 0 else values, title)
+        show_picture(made.figure.subplots(), small / top if top > 0 else small, title)
     return made.png
 
 

@@ -3,8 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
+from plenocli.base.tiling import Plane
 from plenocli.evaluation.results import Result
 from plenocli.evaluation.scores import ResultScore, ScoreDocument
 from plenocli.report.page import Page
@@ -33,7 +32,7 @@ class Compared:
     """
 
     result: Result
-    truth: np.ndarray | None = None
+    truth: Plane | None = None
     block: tuple[int, int] | None = None
 
 
@@ -117,7 +116,7 @@ def add_pictures(page: Page, document: ScoreDocument, drawn: Sequence[Compared |
 
 def add_reconstructions(page: Page, pairs: Sequence[Pair]) -> None:
     """Truth, results and errors of pictures, those on one grid together."""
-    grids: dict[tuple[int, ...], list[tuple[Pair, np.ndarray]]] = {}
+    grids: dict[tuple[int, ...], list[tuple[Pair, Plane]]] = {}
     for pair in pairs:
         truth = pair[1].truth
         if truth is not None:
@@ -126,11 +125,11 @@ def add_reconstructions(page: Page, pairs: Sequence[Pair]) -> None:
         _add_one_grid(page, [pair for pair, _ in found][:_MOST], found[0][1])
 
 
-def _add_one_grid(page: Page, pairs: Sequence[Pair], truth: np.ndarray) -> None:
+def _add_one_grid(page: Page, pairs: Sequence[Pair], truth: Plane) -> None:
     """Pictures on one grid, and a close-up where the lenslets' blocks are known."""
     from plenocli.report.pictures import close_ups, reconstructions
 
-    entries = [(one.label, compared.result.values, _caption(one)) for one, compared in pairs]
+    entries = [(one.label, compared.result.plane, _caption(one)) for one, compared in pairs]
     page.figure(
         reconstructions(entries, truth),
         (

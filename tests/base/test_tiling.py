@@ -1,8 +1,10 @@
 """The tiling of a plane by lenslets."""
 
 import numpy as np
+import pytest
 
-from plenocli.base.tiling import InParts, bands, mirrored, to_blocks, to_plane
+from plenocli.base import tiling
+from plenocli.base.tiling import InParts, Plane, bands, mirrored, to_blocks, to_plane
 
 
 def test_blocks_are_what_stands_in_the_plane_and_go_back():
@@ -41,3 +43,17 @@ def test_an_array_in_parts_is_put_together_plane_by_plane():
     parts = [plane[part] for plane in cube for part in bands(7, 3)]
     whole = InParts(shape=cube.shape, dtype=np.float32, parts=lambda: parts).whole()
     assert whole.dtype == np.float32 and (whole == cube.astype(np.float32)).all()
+
+
+@pytest.mark.parametrize("shape, multiple", [((97, 40), 1), ((96, 40), 12), ((3, 50, 7), 5)])
+def test_bands_of_a_plane_cover_it_and_are_never_thin(monkeypatch, shape, multiple):
+    monkeypatch.setattr(tiling, "BAND", 400)
+    values = np.random.default_rng(2).random(shape)
+    plane = Plane.of(values)
+    found = plane.in_bands(multiple)
+    assert len(found) > 1
+    assert (np.concatenate([plane.window(rows) for rows in found], axis=-2) == values).all()
+    assert all(rows.start % multiple == 0 for rows in found)
+    assert min(rows.stop - rows.start for rows in found) >= min(tiling.LEAST, multiple)
+    doubled = plane.through(lambda part: 2 * part)
+    assert (doubled.window(slice(3, 9), slice(1, 4)) == 2 * values[..., 3:9, 1:4]).all()

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from skimage.metrics import structural_similarity
 
+from plenocli.base import tiling
 from plenocli.evaluation.metrics import quality
 
 
@@ -72,6 +73,35 @@ def test_clipping_helps_only_where_values_leave_the_range():
     scores = quality.score_picture(truth + [[-0.2, 0.2], [0.1, 0]], truth)
     assert scores.psnr_clipped_db == pytest.approx(-10 * np.log10(0.01 / 4))
     assert scores.psnr_db == pytest.approx(-10 * np.log10(0.09 / 4))
+
+
+def test_a_picture_in_bands_has_the_measures_of_the_whole(monkeypatch):
+    """Against formulas over all of it, where the last band is thin and where it is not."""
+    rng = np.random.default_rng(5)
+    for rows, columns in ((180, 90), (174, 90), (48, 90)):
+        truth = rng.random((rows, columns))
+        estimate = truth + 0.2 * rng.standard_normal(truth.shape)
+        sigma = 0.2 * rng.random(truth.shape)
+        monkeypatch.setattr(tiling, "BAND", 40 * columns)
+        found = quality.score_picture(estimate, truth, (6, 9), sigma)
+        error = estimate - truth
+        assert found.rmse == pytest.approx(np.sqrt(np.mean(error**2)), rel=1e-12)
+        kept = error[6:-6, 9:-9]
+        assert found.lenslets.psnr_inner_db == pytest.approx(-10 * np.log10(np.mean(kept**2)))
+        inside = (error < 1.96 * sigma) & (error > -1.96 * sigma)
+        assert found.interval_coverage == pytest.approx(inside.mean(), rel=1e-12)
+        blocks = truth.reshape(rows // 6, 6, columns // 9, 9)
+        spread = (blocks - blocks.mean(axis=(1, 3), keepdims=True)) ** 2
+        assert found.lenslets.block_mean_psnr_db == pytest.approx(-10 * np.log10(spread.mean()))
+        expected = structural_similarity(
+            truth,
+            estimate,
+            data_range=1.0,
+            gaussian_weights=True,
+            sigma=1.5,
+            use_sample_covariance=False,
+        )
+        assert found.ssim == pytest.approx(expected, rel=1e-12)
 
 
 def test_shapes_must_agree():

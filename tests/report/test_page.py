@@ -5,7 +5,12 @@ import numpy as np
 import pytest
 
 from plenocli.evaluation.scores import PatchScore, ResultScore
+from plenocli.files.artefacts.provenance import Provenance
+from plenocli.files.images.mosaic import read_capture, stored_capture, write_capture
+from plenocli.forward.sensor.capture import Capture, Levels
 from plenocli.report import pictures, spectral_pictures
+from plenocli.report.drawing import overview
+from plenocli.report.figures import capture_figures
 from plenocli.report.page import Page
 
 PNG = b"\x89PNG\r\n\x1a\n"
@@ -230,3 +235,26 @@ def test_powers_of_ten_are_drawn_as_such_and_names_are_no_formulas():
     marks = axes.yaxis.get_ticklabels(which="both")
     assert any(r"\mathdefault" in mark.get_text() for mark in marks)
     assert all(mark.get_parse_math() for mark in marks) and not title.get_parse_math()
+
+
+def test_a_large_picture_is_drawn_from_averages_and_an_even_sample():
+    values = np.random.default_rng(4).random((2, 1500, 2300))
+    seen = overview(values)
+    assert seen.step == 3 and seen.small.shape == (2, 500, 766)
+    blocks = values[:, :, :2298].reshape(2, 500, 3, 766, 3)
+    np.testing.assert_allclose(seen.small, blocks.mean(axis=(2, 4)), rtol=1e-12)
+    every = int(np.ceil((values.size / 2**20) ** 0.5))
+    assert sorted(seen.sample) == sorted(values[:, ::every, ::every].ravel())
+    small = overview(values[:, :700, :900])
+    assert small.step == 1 and (small.small == values[:, :700, :900]).all()
+
+
+def test_a_capture_that_stays_in_its_file_looks_as_one_in_memory(tmp_path):
+    """In colour, with a black level for each place of the two by two."""
+    mosaic = 20 + 100 * np.random.default_rng(5).random((90, 71))
+    black = np.array([[10.0, 12.0], [14.0, 16.0]])
+    shot = Capture(mosaic=mosaic, cfa="GRBG", levels=Levels(black=black, white=200.0))
+    write_capture(tmp_path / "a.h5", shot, Provenance(command="made up"))
+    with stored_capture(tmp_path / "a.h5") as stored:
+        found = capture_figures(stored.about, "a.h5", None, stored)
+    assert found == capture_figures(read_capture(tmp_path / "a.h5"), "a.h5")

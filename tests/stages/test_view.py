@@ -11,6 +11,7 @@ from contextlib import closing
 import numpy as np
 import pytest
 
+from plenocli.base.tiling import Plane
 from plenocli.cli.main import run
 from plenocli.evaluation.results import Result
 from plenocli.files.results.volumes import StoredVolume
@@ -284,9 +285,9 @@ def test_a_click_draws_the_spectrum_with_its_bars(browser, tmp_path):
     result = Result(
         path=tmp_path / "chart.h5",
         kind="spectra",
-        values=values,
+        plane=Plane.of(values),
         wavelengths=np.array([450e-9, 500e-9, 550e-9, 650e-9]),
-        sigma=sigma,
+        deviation=Plane.of(sigma),
         quantity="reflectance",
     )
     look(browser, view_page("chart", spectra_panels(result, values, 10**6)), tmp_path / "v.html")
@@ -314,7 +315,7 @@ def test_the_wipe_shows_truth_on_one_side_and_error_on_the_other(browser, tmp_pa
     rng = np.random.default_rng(9)
     truth = rng.uniform(0, 1, (8, 20))
     values = np.clip(truth + 0.3 * (np.arange(20) % 2) - 0.15, 0, None)
-    result = Result(path=tmp_path / "r.h5", kind="image", values=values, method="lmmse")
+    result = Result(path=tmp_path / "r.h5", kind="image", plane=Plane.of(values), method="lmmse")
     panels = picture_panels([result], truth, 10**6)
     look(browser, view_page("r", panels), tmp_path / "v.html")
     top_value = panels[0].layers[0].high

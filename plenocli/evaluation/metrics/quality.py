@@ -5,15 +5,21 @@ whatever the picture's own maximum. Nothing is clipped or rounded here. See
 docs/model.md, "Measures".
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
+from plenocli.base.tiling import Plane
 from plenocli.forward.scene.sample import block_mean
 
+Picture = np.ndarray | Plane
 PEAK = 1.0
 INTERVAL = 1.96
 """Standard deviations, each way, of an interval of 95 %."""
+
+_WINDOW = 11
+"""Samples of a side of the window of the structural similarity."""
 
 DEFINITIONS = {
     "psnr_db": (
@@ -88,44 +94,54 @@ class PictureScore:
     lenslets: LensletScore | None = None
 
 
-def _pair(estimate: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    estimate, truth = (np.asarray(values, dtype=np.float64) for values in (estimate, truth))
-    if estimate.shape != truth.shape:
-        raise ValueError(f"estimate is {estimate.shape}, truth is {truth.shape}")
-    return estimate, truth
-
-
-def rmse(estimate: np.ndarray, truth: np.ndarray) -> float:
+def rmse(estimate: Picture, truth: Picture) -> float:
     """Root mean squared error over all samples, in the unit of the samples."""
-    estimate, truth = _pair(estimate, truth)
-    return float(np.sqrt(np.mean((estimate - truth) ** 2)))
+    squared = _Mean()
+    for _, found, true in _bands(estimate, truth):
+        squared.add((found - true) ** 2)
+    return float(np.sqrt(squared.value))
 
 
-def psnr(estimate: np.ndarray, truth: np.ndarray) -> float:
+def psnr(estimate: Picture, truth: Picture) -> float:
     """Peak signal-to-noise ratio with peak 1.0.
 
     estimate, truth: (..., row, column), linear, white is 1.
 
     Returns -20 log10(rmse), dB; infinite for equal pictures.
     """
-    error = rmse(estimate, truth)
+    return _decibel(rmse(estimate, truth))
+
+
+def _decibel(error: float) -> float:
     return float("inf") if error == 0 else float(-20 * np.log10(error / PEAK))
 
 
-def inner(values: np.ndarray, block: tuple[int, int], border: int = 1) -> np.ndarray | None:
-    """A picture without its outer lenslets.
+class _Mean:
+    """A mean of what comes in parts; of a single part its own."""
 
-    values: (..., row, column).
-    block: (rows, columns) of samples under a lenslet.
-    border: rings of lenslets that are left out.
+    def __init__(self) -> None:
+        self._total, self._count = 0.0, 0
 
-    Returns a view of (..., row, column), None if nothing is left.
-    """
-    (height, width), (rows, cols) = block, np.shape(values)[-2:]
-    top, left = border * height, border * width
-    if rows <= 2 * top or cols <= 2 * left:
-        return None
-    return np.asarray(values)[..., top : rows - top, left : cols - left]
+    def add(self, values: np.ndarray) -> None:
+        """Count a part in."""
+        self._total += float(np.sum(values))
+        self._count += values.size
+
+    @property
+    def value(self) -> float:
+        """NaN without a part."""
+        return self._total / self._count if self._count else np.nan
+
+
+def _bands(
+    estimate: Picture, truth: Picture, multiple: int = 1
+) -> Iterator[tuple[slice, np.ndarray, np.ndarray]]:
+    """(rows, estimate, truth) of two pictures of one shape, from the first row to the last."""
+    estimate, truth = Plane.of(estimate), Plane.of(truth)
+    if estimate.shape != truth.shape:
+        raise ValueError(f"estimate is {estimate.shape}, truth is {truth.shape}")
+    for rows in truth.in_bands(multiple):
+        yield rows, estimate.window(rows), truth.window(rows)
 
 
 def ssim(estimate: np.ndarray, truth: np.ndarray) -> float:
@@ -138,8 +154,8 @@ def ssim(estimate: np.ndarray, truth: np.ndarray) -> float:
     """
     from skimage.metrics import structural_similarity
 
-    estimate, truth = _pair(estimate, truth)
-    if min(truth.shape[-2:]) < 11:
+    estimate, truth = (np.asarray(values, dtype=np.float64) for values in (estimate, truth))
+    if min(truth.shape[-2:]) < _WINDOW:
         return np.nan
     bands = zip(
         estimate.reshape(-1, *truth.shape[-2:]), truth.reshape(-1, *truth.shape[-2:]), strict=True
@@ -161,14 +177,6 @@ def ssim(estimate: np.ndarray, truth: np.ndarray) -> float:
     )
 
 
-def coverage(estimate: np.ndarray, truth: np.ndarray, sigma: np.ndarray) -> float:
-    """Share of the samples whose interval of 95 % holds the truth.
-
-    estimate, truth, sigma: of one shape; sigma is half the width of the interval over INTERVAL.
-    """
-    return float(np.mean(np.abs(estimate - truth) <= INTERVAL * sigma))
-
-
 def block_mean_baseline(truth: np.ndarray, block: tuple[int, int]) -> np.ndarray:
     """The truth with each lenslet's block replaced by its mean.
 
@@ -182,38 +190,76 @@ def block_mean_baseline(truth: np.ndarray, block: tuple[int, int]) -> np.ndarray
 
 
 def score_picture(
-    estimate: np.ndarray,
-    truth: np.ndarray,
+    estimate: Picture,
+    truth: Picture,
     block: tuple[int, int] | None = None,
-    sigma: np.ndarray | None = None,
+    sigma: Picture | None = None,
 ) -> PictureScore:
-    """All measures of DEFINITIONS for one picture.
+    """All measures of DEFINITIONS for one picture, which is worked through in bands of rows.
 
     estimate, truth: (..., row, column), linear, white is 1.
     block: (rows, columns) of samples under one lenslet; without it the lenslet-wise measures
         are left out.
-    sigma: predicted standard deviation, like estimate.
+    sigma: predicted standard deviation, like estimate: half the width of the interval of 95 % over
+        INTERVAL.
     """
-    estimate, truth = _pair(estimate, truth)
-    whole = psnr(estimate, truth)
+    shape, deviation = Plane.of(truth).shape, None if sigma is None else Plane.of(sigma)
+    whole, clipped, within, middle, baseline = (_Mean() for _ in range(5))
+    similarity = _Similarity(shape)
+    for rows, found, true in _bands(estimate, truth, block[0] if block else 1):
+        error = found - true
+        whole.add(error**2)
+        clipped.add((np.clip(found, 0, PEAK) - true) ** 2)
+        similarity.add(found, true)
+        if deviation is not None:
+            within.add(np.abs(error) <= INTERVAL * deviation.window(rows))
+        if block is not None:
+            middle.add(_inner(error, block, rows, shape[-2]) ** 2)
+            baseline.add((block_mean_baseline(true, block) - true) ** 2)
+    error = float(np.sqrt(whole.value))
+    lenslets = None
+    if block is not None:
+        floor = _decibel(float(np.sqrt(baseline.value)))
+        lenslets = LensletScore(
+            psnr_inner_db=_decibel(float(np.sqrt(middle.value))),
+            block_mean_psnr_db=floor,
+            gain_over_block_mean_db=_decibel(error) - floor if np.isfinite(floor) else np.nan,
+        )
     return PictureScore(
-        psnr_db=whole,
-        psnr_clipped_db=psnr(np.clip(estimate, 0, PEAK), truth),
-        rmse=rmse(estimate, truth),
-        ssim=ssim(estimate, truth),
-        interval_coverage=None if sigma is None else coverage(estimate, truth, sigma),
-        lenslets=None if block is None else _score_lenslets(estimate, truth, whole, block),
+        psnr_db=_decibel(error),
+        psnr_clipped_db=_decibel(float(np.sqrt(clipped.value))),
+        rmse=error,
+        ssim=similarity.value,
+        interval_coverage=None if sigma is None else within.value,
+        lenslets=lenslets,
     )
 
 
-def _score_lenslets(
-    estimate: np.ndarray, truth: np.ndarray, whole: float, block: tuple[int, int]
-) -> LensletScore:
-    """Measures that need the blocks; `whole`: PSNR of the whole picture, dB."""
-    middle, true_middle = inner(estimate, block), inner(truth, block)
-    baseline = psnr(block_mean_baseline(truth, block), truth)
-    return LensletScore(
-        np.nan if middle is None or true_middle is None else psnr(middle, true_middle),
-        baseline,
-        whole - baseline if np.isfinite(baseline) else np.nan,
-    )
+def _inner(error: np.ndarray, block: tuple[int, int], rows: slice, count: int) -> np.ndarray:
+    """What of the rows of a picture of `count` rows is not under its outermost lenslets."""
+    (height, width), columns = block, error.shape[-1]
+    first, last = max(height - rows.start, 0), min(count - height, rows.stop) - rows.start
+    return error[..., first : max(last, first), width : max(columns - width, width)]
+
+
+class _Similarity:
+    """Mean structural similarity of a picture that comes in bands of rows, each with those of the
+    last one that its windows reach into.
+    """
+
+    def __init__(self, shape: tuple[int, ...]) -> None:
+        self.value, self._rows = np.nan, 0
+        self._small = min(shape[-2:]) < _WINDOW
+        self._held: tuple[np.ndarray, ...] = ()
+
+    def add(self, *pair: np.ndarray) -> None:
+        """Count the next band of estimate and truth in, (..., row, column)."""
+        if self._small:
+            return
+        if self._held:
+            pair = tuple(np.concatenate(two, axis=-2) for two in zip(self._held, pair))
+        rows = pair[0].shape[-2] - _WINDOW + 1
+        self._held = tuple(one[..., rows:, :] for one in pair)
+        self._rows += rows
+        before = 0.0 if self._rows == rows else self.value
+        self.value = before + (ssim(*pair) - before) * (rows / self._rows)

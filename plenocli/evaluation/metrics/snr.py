@@ -3,10 +3,13 @@
 All in dB (docs/model.md, "Measures").
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
+
+from plenocli.base.tiling import Plane
 
 DEFINITIONS = {
     "snr_capture_db": (
@@ -114,16 +117,21 @@ def snr_predicted(value: np.ndarray, sigma: np.ndarray) -> np.ndarray:
     return _ratio(value[:, valid].mean(1), np.sqrt((sigma[:, valid] ** 2).mean(1)))
 
 
-def snr_sensor(signal: ArrayLike, sigma: float, noisy: bool = False) -> float:
+def snr_sensor(signal: ArrayLike | Plane, sigma: float, noisy: bool = False) -> float:
     """Sensor-model SNR of a capture with white noise, 10 log10(mean(y^2) / sigma^2).
 
-    signal: any shape.
+    signal: any shape, or a Plane.
     sigma: standard deviation of the noise, in the unit of the signal.
     noisy: the signal carries the noise already, whose power is taken off.
 
     Returns dB; -inf where nothing is left.
     """
-    power = np.mean(np.asarray(signal, dtype=np.float64) ** 2) - (sigma**2 if noisy else 0.0)
+    if isinstance(signal, Plane):
+        total = sum(float(np.sum(signal.window(rows) ** 2)) for rows in signal.in_bands())
+        mean = total / math.prod(signal.shape)
+    else:
+        mean = float(np.mean(np.asarray(signal, dtype=np.float64) ** 2))
+    power = mean - (sigma**2 if noisy else 0.0)
     return float(_ratio(np.sqrt(max(float(power), 0.0)), float(sigma)))
 
 

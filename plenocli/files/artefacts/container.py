@@ -14,6 +14,7 @@ import errno
 import hashlib
 import itertools
 import json
+import math
 import os
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping
@@ -28,7 +29,7 @@ from plenocli import __version__
 from plenocli.base.budget import budget
 from plenocli.base.errors import InputError, PlenoError
 from plenocli.base.text import utf8
-from plenocli.base.tiling import InParts
+from plenocli.base.tiling import EVERYTHING, InParts
 from plenocli.files.artefacts import schema as tables
 from plenocli.files.artefacts.kinds import SCHEMAS
 from plenocli.files.artefacts.provenance import (
@@ -476,40 +477,52 @@ def _verified_bytes(path: Path) -> memoryview:
     return image
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Stored:
-    """A dataset that stays in its file, from which windows are read; its values are for the caller
-    to look at.
+    """A dataset that stays in its file, from which windows are read and checked.
 
     path: of the file.
-    dataset: what h5py reads slices of.
+    name: of the dataset.
+    shape, dtype: as it is stored.
+    schema: the table that its values follow.
     """
 
     path: Path
-    dataset: Any
+    name: str
+    shape: tuple[int, ...]
+    dtype: np.dtype
+    schema: tables.Schema
 
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """Of the dataset."""
-        return self.dataset.shape
+    def window(self, rows: slice = EVERYTHING, columns: slice = EVERYTHING) -> np.ndarray:
+        """Part of the last two axes.
 
-    def window(self, rows: slice, columns: slice = slice(None)) -> np.ndarray:
-        """Part of the last two axes; InputError where it cannot be read."""
+        Raises InputError where it cannot be read or breaks the table, NumericsError where the
+        memory of this process does not hold it.
+        """
         seconds = _LOOK_S + self.path.stat().st_size // _SLOWEST
-        name, shape = self.dataset.name, self.shape
-        part = [*rows.indices(shape[-2])[:2], *columns.indices(shape[-1])[:2]]
-        return outside(window, self.path, name, part, seconds=seconds)[name]
+        sides = [rows.indices(self.shape[-2])[:2], columns.indices(self.shape[-1])[:2]]
+        count = math.prod([*self.shape[:-2], *(last - first for first, last in sides)])
+        budget().require_reading(self.path, 2 * count * self.dtype.itemsize)
+        part = [*sides[0], *sides[1]]
+        values = outside(window, self.path, self.name, part, seconds=seconds)[self.name]
+        problems = tables.value_problems(replace(self.schema, rules=()), {self.name: values})
+        if problems:
+            raise InputError(
+                f"breaks the table of its kind: {'; '.join(problems)}", self.path, "make it again"
+            )
+        return values
 
 
 @contextlib.contextmanager
 def opened_artefact(
     path: str | os.PathLike,
-    kind: str | tuple[str, ...],
+    kind: str | tuple[str, ...] | None,
     apart: Collection[str],
     *,
     verify: bool = True,
 ) -> Iterator[tuple[Artefact, Mapping[str, Stored]]]:
-    """As read_artefact, but for large datasets whose values are read bit by bit.
+    """As read_artefact, but for large datasets whose values are read bit by bit; these may be read
+    after the block, too.
 
     path, kind: as of read_artefact.
     apart: the datasets that stay in the file, whose bytes are verified before.
@@ -531,7 +544,17 @@ def opened_artefact(
             values = outside(compressed_values, path, sorted(apart), seconds=seconds)
             file = stack.enter_context(h5py.File(Behind(descriptor, HEADER_BYTES), "r"))
             artefact = _parse(path, file, kind, apart, values)
-            found = {name: Stored(path, file[name]) for name in apart if name in file}
+            found = {
+                name: Stored(
+                    path=path,
+                    name=name,
+                    shape=file[name].shape,
+                    dtype=file[name].dtype,
+                    schema=SCHEMAS[artefact.kind],
+                )
+                for name in apart
+                if name in file
+            }
         yield artefact, found
 
 

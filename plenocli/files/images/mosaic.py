@@ -117,9 +117,8 @@ class StoredCapture:
         """The capture of a part of the sensor. Raises InputError."""
         values = self.mosaic.window(rows, columns)
         _require_sound(self.mosaic.path, values)
-        levels = self.about.levels
-        black = np.roll(levels.black, (-rows.start, -columns.start), axis=(0, 1))
-        return replace(self.about, mosaic=values, levels=replace(levels, black=black))
+        first = (part.indices(side)[0] for part, side in zip((rows, columns), self.shape))
+        return replace(self.about, mosaic=values, levels=self.about.levels.from_pixel(*first))
 
 
 @contextlib.contextmanager
@@ -137,7 +136,7 @@ def stored_capture(path: str | Path, *, verify: bool = True) -> Iterator[StoredC
     apart = ("capture/mosaic", "capture/scene")
     with opened_artefact(path, "capture", apart, verify=verify) as (artefact, stored):
         mosaic = stored["capture/mosaic"]
-        blank = np.empty((0, 0), mosaic.dataset.dtype)
+        blank = np.empty((0, 0), mosaic.dtype)
         yield StoredCapture(_capture_of(path, artefact, blank), mosaic)
 
 

@@ -3,6 +3,7 @@ planes.
 """
 
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,6 +11,7 @@ import numpy as np
 
 from plenocli.base.errors import InputError, UsageError
 from plenocli.base.text import by
+from plenocli.base.tiling import Plane
 from plenocli.evaluation.response_score import ComparedResponse
 from plenocli.evaluation.results import Result, ToldFigures, WhiteTarget
 from plenocli.files.results.lightfields import lightfield_of
@@ -17,7 +19,7 @@ from plenocli.files.results.volumes import StoredVolume, volume_of
 from plenocli.inverse.lightfield.planes import LightField
 
 if TYPE_CHECKING:
-    from plenocli.files.artefacts.container import Artefact
+    from plenocli.files.artefacts.container import Artefact, Stored
 
 PICTURES = ("image", "spectra", "dictionary")
 SCORED = (*PICTURES, "calibration", "lightfield", "volume")
@@ -33,9 +35,7 @@ def read_scored(path: Path | str) -> Result | ComparedResponse | LightField | St
     path = Path(path)
     if path.suffix != ".h5":
         return read_result(path, SCORED)
-    from plenocli.files.artefacts.container import read_artefact
-
-    artefact = read_artefact(path, SCORED)
+    artefact = _opened(path, SCORED)
     if artefact.kind == "calibration":
         return _response_of(artefact, path)
     if artefact.kind == "volume":
@@ -80,9 +80,7 @@ def read_result(path: Path | str, kinds: tuple[str, ...] = PICTURES) -> Result:
     """
     path = Path(path)
     if path.suffix == ".h5":
-        from plenocli.files.artefacts.container import read_artefact
-
-        return result_of(read_artefact(path, kinds), path)
+        return result_of(_opened(path, kinds), path)
     if path.suffix.lower() != ".exr":
         raise InputError(
             f"is {path.suffix or 'a file without a suffix'}, not a result",
@@ -99,6 +97,14 @@ def read_result(path: Path | str, kinds: tuple[str, ...] = PICTURES) -> Result:
     return found
 
 
+def _opened(path: Path, kinds: tuple[str, ...]) -> "Artefact":
+    """The artefact at a path, verified; the values of a picture are Stored."""
+    from plenocli.files.artefacts.container import opened_artefact
+
+    with opened_artefact(path, kinds, ("image/value", "image/sigma")) as (artefact, stored):
+        return replace(artefact, data={**artefact.data, **stored})
+
+
 def result_of(artefact: "Artefact", path: Path | str) -> Result:
     """The Result that an image, spectra or dictionary artefact holds; `path`: its file."""
     kind, data = artefact.kind, artefact.data
@@ -109,7 +115,7 @@ def result_of(artefact: "Artefact", path: Path | str) -> Result:
         return Result(
             path=Path(path),
             kind=kind,
-            values=data["dictionary/atoms"],
+            plane=Plane.of(data["dictionary/atoms"]),
             method=method,
             scale=float(attrs.get("scale") or 1.0),
             object_shape=None if shape is None else tuple(int(n) for n in shape),
@@ -119,15 +125,13 @@ def result_of(artefact: "Artefact", path: Path | str) -> Result:
                 if key.startswith(_HISTORY)
             },
         )
-    values = np.asarray(data[f"{kind}/value"], dtype=np.float64)
-    if kind == "image" and values.ndim == 3 and len(values) == 1:
-        values = values[0]
+    plane = _plane(data[f"{kind}/value"], kind)
     return Result(
         path=Path(path),
         kind=kind,
-        values=values,
-        wavelengths=data.get(f"{kind}/wavelength") if values.ndim == 3 else None,
-        sigma=data.get(f"{kind}/sigma"),
+        plane=plane,
+        wavelengths=data.get(f"{kind}/wavelength") if len(plane.shape) == 3 else None,
+        deviation=_plane(sigma, kind) if (sigma := data.get(f"{kind}/sigma")) is not None else None,
         s1=data.get("spectra/s1"),
         quantity=str(attrs.get("quantity", "")),
         method=method,
@@ -136,6 +140,19 @@ def result_of(artefact: "Artefact", path: Path | str) -> Result:
         seen=data.get("image/seen"),
         rgb=data.get("image/rgb"),
     )
+
+
+def _plane(values: "np.ndarray | Stored", kind: str) -> Plane:
+    """Of what an artefact holds, or of what stays in its file; one band of a picture has no axis of
+    its own.
+    """
+    if isinstance(values, np.ndarray):
+        plane = Plane.of(values)
+    else:
+        plane = Plane(values.shape, values.window)
+    if kind != "image" or len(plane.shape) != 3 or plane.shape[0] != 1:
+        return plane
+    return Plane(plane.shape[1:], lambda rows, columns: plane.read(rows, columns)[0])
 
 
 def _block(notes: Any) -> tuple[int, int] | None:
@@ -167,9 +184,9 @@ def _from_exr(path: Path) -> Result:
         return Result(
             path=path,
             kind="spectra",
-            values=np.asarray(spectral.values, dtype=np.float64),
+            plane=Plane.of(spectral.values),
             wavelengths=np.asarray(spectral.wavelengths),
-            sigma=spectral.sigma,
+            deviation=None if spectral.sigma is None else Plane.of(spectral.sigma),
             quantity=spectral.quantity,
             method=str(spectral.attrs.get("method", "")),
         )
@@ -185,7 +202,7 @@ def _from_exr(path: Path) -> Result:
     return Result(
         path=path,
         kind="image",
-        values=np.asarray(values, dtype=np.float64),
+        plane=Plane.of(values),
         method=str(attrs.get("method", "")),
         rgb=np.stack(colour) if len(colour) == 3 else None,
     )
@@ -199,9 +216,9 @@ def read_block(result: Result, truth: Path | str | None) -> tuple[int, int] | No
     if result.block is not None:
         return result.block
     if truth is not None and Path(truth).suffix == ".h5":
-        from plenocli.files.artefacts.container import read_artefact
+        from plenocli.files.results.truths import opened_truth
 
-        attrs = read_artefact(truth, ("capture", "spectra", "image")).attrs.get("capture", {})
+        attrs = opened_truth(truth).attrs.get("capture", {})
         count = [int(n) for n in np.ravel(attrs.get("lenslet_count", ()))]
         if count and all(n % c == 0 for n, c in zip(result.grid, count, strict=True)):
             rows, columns = (n // c for n, c in zip(result.grid, count, strict=True))

@@ -1,22 +1,34 @@
 """Truths and label maps from their files, brought to the grid and the bands of a result."""
 
+import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from plenocli.base.errors import InputError, UsageError
+from plenocli.base.tiling import Plane
 from plenocli.evaluation.results import Result
 from plenocli.forward.camera.model import Camera
 
+if TYPE_CHECKING:
+    from plenocli.files.artefacts.container import Artefact
+    from plenocli.forward.scene.scenes import Scene
+
 CHART = "colorchecker"
+GREEN = 550e-9
+"""Wavelength, m, at which a scene stands for a single picture."""
+_AHEAD = 1 << 21
+"""Points of a photograph that are made at once."""
 _CHART_OVERSAMPLING = 20
 """Chart samples per lenslet and side when the truth of a mixed lenslet is averaged."""
 
 
 def read_truth(
     truth: Path | str, result: Result, sampling: str = "fit", camera: Camera | None = None
-) -> np.ndarray:
+) -> Plane:
     """The truth on the grid and at the wavelengths of a result.
 
     truth: a path, or a name that read_scene knows. A capture brings the object that it was
@@ -25,7 +37,7 @@ def read_truth(
     camera: through whose filters a scene is seen (width, leak, light and all), instead of at
         their centres.
 
-    Returns an array like the values of the result.
+    Returns a plane like that of the result; that of a single picture is read when it is asked for.
     Raises InputError where no comparison is possible.
     """
     rows, cols = result.grid
@@ -44,17 +56,18 @@ def read_truth(
     if known is None:
         return _scene_truth(truth, result, sampling, camera)
     values, wavelengths = known
-    if not spectral and len(values) != 1:
+    if not spectral and values.shape[0] != 1:
         raise InputError(
-            f"has {len(values)} bands, the result has one and does not say which",
+            f"has {values.shape[0]} bands, the result has one and does not say which",
             truth,
             "compare bands with a spectral result",
         )
-    if spectral:
-        values = _at_wavelengths(values, wavelengths, result.bands, truth)
-    _same_aspect(values.shape[-2:], (rows, cols), truth)
-    values = np.array([_coarser(plane, rows, cols) for plane in values])
-    return values if spectral else values[0]
+    if not spectral:
+        _same_aspect(values.shape[-2:], (rows, cols), truth)
+        return _coarser_plane(values, rows, cols)
+    bands = _at_wavelengths(values.window(), wavelengths, result.bands, truth)
+    _same_aspect(bands.shape[-2:], (rows, cols), truth)
+    return Plane.of(np.array([_coarser(plane, rows, cols) for plane in bands]))
 
 
 def read_true_s1(truth: Path | str, result: Result) -> np.ndarray | None:
@@ -63,20 +76,16 @@ def read_true_s1(truth: Path | str, result: Result) -> np.ndarray | None:
     """
     if Path(truth).suffix != ".h5":
         return None
-    from plenocli.files.artefacts.container import read_artefact
-
-    artefact = read_artefact(truth, ("capture", "spectra", "image"))
+    artefact = opened_truth(truth)
     degree = artefact.data.get("capture/polarisation")
     if degree is None or "capture/scene" not in artefact.data:
         return None
-    values = np.asarray(artefact.data["capture/scene"], float) * degree
+    values = artefact.data["capture/scene"].window() * degree
     values = _at_wavelengths(values, artefact.data.get("capture/wavelength"), result.bands, truth)
     return np.array([_coarser(plane, *result.grid) for plane in values])
 
 
-def _scene_truth(
-    truth: Path | str, result: Result, sampling: str, camera: Camera | None
-) -> np.ndarray:
+def _scene_truth(truth: Path | str, result: Result, sampling: str, camera: Camera | None) -> Plane:
     """The truth of a scene, which has values at any wavelength."""
     from plenocli.files.read.scenes import read_scene
     from plenocli.forward.scene.labelled import SpectraChart
@@ -98,18 +107,49 @@ def _scene_truth(
         seen = _coarser(scene.at(wavelength, rows * fine, cols * fine), rows, cols)
         return np.where(whole, seen, np.nan)
 
-    if spectral and camera is not None:
-        return through_filters(plane, camera, result.bands)
-    planes = [plane(w) for w in (result.bands if spectral else [550e-9])]
-    return np.array(planes) if spectral else planes[0]
+    if not spectral:
+        return Plane((rows, cols), _Ahead(scene, rows, cols))
+    if camera is not None:
+        return Plane.of(through_filters(plane, camera, result.bands))
+    return Plane.of(np.array([plane(w) for w in result.bands]))
+
+
+class _Ahead:
+    """Windows of a scene at GREEN on rows x columns points; more rows are made at once than are
+    asked for, because each time the whole photograph is looked at.
+    """
+
+    def __init__(self, scene: "Scene", rows: int, columns: int) -> None:
+        self.scene, self.shape = scene, (rows, columns)
+        self._made, self._rows = np.empty((0, columns), np.float32), slice(0, 0)
+
+    def __call__(self, rows: slice, columns: slice) -> np.ndarray:
+        """As Plane.read."""
+        first, last, _ = rows.indices(self.shape[0])
+        if first < self._rows.start or last > self._rows.stop:
+            ahead = max(last, min(first + _AHEAD // self.shape[1], self.shape[0]))
+            self._rows = slice(first, ahead)
+            self._made = self.scene.at(GREEN, *self.shape, self._rows)
+        at = self._rows.start
+        return self._made[first - at : last - at, columns]
 
 
 def _is_scene(path: Path | str) -> bool:
     """Whether an .h5 is an image with wavelengths, which serves as a scene at any of them."""
-    from plenocli.files.artefacts.container import read_artefact
+    artefact = opened_truth(path)
+    return artefact.kind == "image" and len(artefact.data["image/value"].shape) == 3
 
-    artefact = read_artefact(path, ("capture", "spectra", "image"))
-    return artefact.kind == "image" and artefact.data["image/value"].ndim == 3
+
+def opened_truth(path: Path | str) -> "Artefact":
+    """An artefact that holds a truth, verified; its pictures are Stored.
+
+    Raises InputError for another kind.
+    """
+    from plenocli.files.artefacts.container import opened_artefact
+
+    apart = ("capture/mosaic", "capture/scene", "image/value", "image/sigma")
+    with opened_artefact(path, ("capture", "spectra", "image"), apart) as (artefact, stored):
+        return replace(artefact, data={**artefact.data, **stored})
 
 
 def through_filters(
@@ -166,32 +206,31 @@ def through_filters(
     return total / weights.sum(axis=1)[:, None, None]
 
 
-def _known_truth(truth: Path | str) -> tuple[np.ndarray, np.ndarray | None] | None:
+def _known_truth(truth: Path | str) -> tuple[Plane, np.ndarray | None] | None:
     """(values (band, row, column), wavelengths or None) of a capture or spectra artefact; None
     for everything else.
     """
     path = Path(truth)
     if path.suffix != ".h5":
         return None
-    from plenocli.files.artefacts.container import read_artefact
-
-    artefact = read_artefact(path, ("capture", "spectra", "image"))
-    if artefact.kind == "spectra":
-        return np.asarray(artefact.data["spectra/value"], dtype=np.float64), artefact.data[
-            "spectra/wavelength"
-        ]
-    if artefact.kind == "image":
-        values = np.asarray(artefact.data["image/value"], dtype=np.float64)
-        return (values if values.ndim == 3 else values[None]), artefact.data.get("image/wavelength")
-    if "capture/scene" not in artefact.data:
+    artefact = opened_truth(path)
+    kind = artefact.kind
+    name, data = "scene" if kind == "capture" else "value", artefact.data
+    if f"{kind}/{name}" not in data:
         raise InputError(
             "holds no scene: it was measured, or simulated without one",
             path,
             "name the truth itself with --truth",
         )
-    return np.asarray(artefact.data["capture/scene"], dtype=np.float64), artefact.data.get(
-        "capture/wavelength"
-    )
+    stored = data[f"{kind}/{name}"]
+    if isinstance(stored, np.ndarray):
+        plane = Plane.of(stored)
+    else:
+        plane = Plane(stored.shape, stored.window)
+    if len(plane.shape) == 2:
+        picture = plane
+        plane = Plane((1, *picture.shape), lambda rows, columns: picture.read(rows, columns)[None])
+    return plane, data.get(f"{kind}/wavelength")
 
 
 def _at_wavelengths(
@@ -240,6 +279,26 @@ def _coarser(plane: np.ndarray, rows: int, cols: int) -> np.ndarray:
         if plane.shape == (rows, cols)
         else area_average(area_average(plane, rows, 0), cols, 1)
     )
+
+
+def _coarser_plane(values: Plane, rows: int, cols: int) -> Plane:
+    """One band, (1, row, column), averaged over areas to (rows, cols)."""
+    from plenocli.forward.scene.sample import area_average
+
+    high, wide = values.shape[-2:]
+    if (high, wide) == (rows, cols):
+        return Plane((rows, cols), lambda part, columns: values.read(part, columns)[0])
+    size = high / rows
+
+    def averaged(part: slice, columns: slice) -> np.ndarray:
+        first, last, _ = part.indices(rows)
+        top, bottom = int(first * size), min(math.ceil(last * size), high)
+        found = values.window(slice(top, bottom))[0]
+        edges = (first * size - top, min(last * size - top, bottom - top))
+        found = area_average(found, last - first, 0, *edges)
+        return area_average(found, cols, 1)[:, columns]
+
+    return Plane((rows, cols), averaged)
 
 
 def read_labels(source: Path | str, grid: tuple[int, int]) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -28,6 +28,10 @@ class Levels:
     black: np.ndarray = field(default_factory=lambda: np.zeros((2, 2)))
     white: float = np.inf
     gain: float | None = None
+
+    def from_pixel(self, row: int, column: int) -> Levels:
+        """Those of a part of the sensor that begins at a pixel."""
+        return replace(self, black=np.roll(self.black, (-row, -column), axis=(0, 1)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,6 +139,16 @@ class Capture:
     def white_noise(self) -> Noise | None:
         """The noise where it is the same for every signal, else None."""
         return self.noise if self.noise is not None and self.noise.is_white else None
+
+    def window(self, rows: slice, columns: slice) -> Capture:
+        """The capture of a part of the sensor."""
+        top, left = rows.indices(self.shape[0])[0], columns.indices(self.shape[1])[0]
+        return replace(
+            self,
+            mosaic=self.mosaic[rows, columns],
+            mask=None if self.mask is None else self.mask[rows, columns],
+            levels=self.levels.from_pixel(top, left),
+        )
 
     def signal(self) -> np.ndarray:
         """(row, column) float64 values above the black level; NaN where the mask says so."""

@@ -94,22 +94,31 @@ def colour_profile(camera: Camera) -> ColourProfile | None:
     )
 
 
-def preview(signal: np.ndarray, cfa: str, profile: ColourProfile | None) -> np.ndarray:
-    """A picture of a mosaic of colours, half as large.
+def colour_planes(signal: np.ndarray, cfa: str) -> np.ndarray:
+    """Mean R, G and B of every two by two pixels of a mosaic of colours.
 
     signal: (row, column) above black.
     cfa: four letters.
-    profile: None: R, G and B are taken for those of the screen. Where it does not tell white, the
-        picture is grey on the whole.
 
-    Returns (row // 2, column // 2, 3) linear sRGB, unclipped; the brightest hundredth is above 1.
+    Returns (3, row // 2, column // 2).
     """
     rows, columns = (n // 2 * 2 for n in signal.shape)
     colour = cfa_map((2, 2), cfa)
     quads = signal[:rows, :columns].reshape(rows // 2, 2, columns // 2, 2).transpose(1, 3, 0, 2)
-    planes = np.stack(
+    return np.stack(
         [quads[colour == c].mean(axis=0) if c in cfa else quads.mean(axis=(0, 1)) for c in "RGB"]
     )
+
+
+def preview(planes: np.ndarray, profile: ColourProfile | None) -> np.ndarray:
+    """A picture of the colours of a mosaic.
+
+    planes: (3, row, column) R, G and B, as colour_planes makes them.
+    profile: None: R, G and B are taken for those of the screen. Where it does not tell white, the
+        picture is grey on the whole.
+
+    Returns (row, column, 3) linear sRGB, unclipped; the brightest hundredth is above 1.
+    """
     neutral = None if profile is None else profile.neutral
     neutral = planes.mean(axis=(1, 2)) if neutral is None else neutral
     planes = planes / np.maximum(neutral, 1e-6 * max(float(neutral.max()), 1e-30))[:, None, None]

@@ -14,6 +14,7 @@ import numpy as np
 from plenocli.base.errors import InputError, PlenoError, UsageError
 from plenocli.base.progress import note
 from plenocli.base.text import json_value
+from plenocli.base.tiling import Plane
 from plenocli.evaluation.chosen import definitions_of, keep_chosen
 from plenocli.evaluation.depth_score import known_depth, score_layered, score_lightfield
 from plenocli.evaluation.metrics.coherence import CoherenceScore, dictionary_coherence
@@ -51,9 +52,6 @@ if TYPE_CHECKING:
     from plenocli.forward.camera.model import Camera
     from plenocli.forward.scene.labelled import LabelledSpectra
     from plenocli.report.score_page import Compared
-
-POINT_BYTES = 128
-"""Memory for each point of a picture that is compared (measured)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -469,19 +467,18 @@ def _score_image(result: Result, comparison: _Comparison) -> _Scored:
             ),
         )
     truth = read_truth(comparison.truth, result, comparison.sampling, comparison.camera)
-    if not np.isfinite(truth).any():
-        raise InputError("holds no finite value", comparison.truth, "name a truth that has values")
     block, patches, spectra, polarised = None, None, None, None
     bands: tuple[float, ...] = ()
     if result.wavelengths is None:
         block = _block(result, comparison)
         own: PictureScore | SpectraScore = _score_picture(result, truth, block, comparison)
     else:
-        bands = _nanometres(result.wavelengths)
+        bands, true = _nanometres(result.wavelengths), truth.window()
+        _require_values(truth, comparison.truth)
         labels = comparison.patches
         own, patches = score_spectra(
             result,
-            truth,
+            true,
             labels=None if labels is None else read_labels(labels, result.grid),
             light=comparison.light,
             whites=comparison.whites,
@@ -560,22 +557,8 @@ def _block(result: Result, comparison: _Comparison) -> tuple[int, int] | None:
 
 
 def _score_picture(
-    result: Result, truth: np.ndarray, block: tuple[int, int] | None, comparison: _Comparison
+    result: Result, truth: Plane, block: tuple[int, int] | None, comparison: _Comparison
 ) -> PictureScore:
-    from plenocli.base.budget import budget
-
-    budget().require(
-        POINT_BYTES * truth.size,
-        "the comparison",
-        result.path,
-        "score a part of it",
-    )
-    if not (np.isfinite(result.values).all() and np.isfinite(truth).all()):
-        raise InputError(
-            "holds values that are not finite",
-            result.path,
-            "reconstruct again; pictures have no gaps",
-        )
     if block is not None and any(n % b for n, b in zip(result.grid, block, strict=True)):
         raise UsageError(
             (
@@ -585,15 +568,33 @@ def _score_picture(
             result.path,
             "correct --block",
         )
-    return score_picture(result.values, truth, block, result.sigma)
+
+    def sound(values: np.ndarray) -> np.ndarray:
+        if not np.isfinite(values).all():
+            _require_values(truth, comparison.truth)
+            raise InputError(
+                "holds values that are not finite",
+                result.path,
+                "reconstruct again; pictures have no gaps",
+            )
+        return values
+
+    return score_picture(result.plane.through(sound), truth.through(sound), block, result.deviation)
+
+
+def _require_values(truth: Plane, where: Path | str | None) -> None:
+    """InputError for a truth without a finite value."""
+    if not any(np.isfinite(truth.window(rows)).any() for rows in truth.in_bands()):
+        raise InputError("holds no finite value", where, "name a truth that has values")
 
 
 def _sensor_snr(path: Path | str) -> float:
     """Sensor-model SNR of a capture from its mosaic and the noise it says it got, dB."""
-    from plenocli.files.artefacts.container import read_artefact
+    from plenocli.files.artefacts.container import opened_artefact
 
-    capture = read_artefact(path, "capture")
-    attrs = capture.attrs.get("capture", {})
+    apart = ("capture/mosaic", "capture/scene")
+    with opened_artefact(path, "capture", apart) as (capture, stored):
+        attrs, mosaic = capture.attrs.get("capture", {}), stored["capture/mosaic"]
     sigma = float(attrs.get("noise_sigma") or 0)
     if not sigma > 0:
         raise InputError(
@@ -601,9 +602,8 @@ def _sensor_snr(path: Path | str) -> float:
             path,
             "simulate it with capture-sim --snr, or leave --capture out",
         )
-    signal = np.asarray(capture.data["capture/mosaic"], dtype=np.float64) - float(
-        np.mean(attrs.get("black") or 0)
-    )
+    black = float(np.mean(attrs.get("black") or 0))
+    signal = Plane(mosaic.shape, mosaic.window).through(lambda values: values - black)
     return snr_sensor(signal, sigma, noisy=True)
 
 

@@ -131,13 +131,16 @@ def _require_inside(
 
 
 def _capture(file: OpenedFile, choice: _Choice) -> Figures:
-    from plenocli.files.images.mosaic import read_capture
+    from plenocli.files.images.mosaic import read_capture, stored_capture
     from plenocli.report.figures import capture_figures
 
-    centres = choice.centres
+    name, centres = file.path.name, choice.centres
     if centres is None and file.artefact is not None:
         centres = file.artefact.data.get("capture/lenslet_centre")
-    return capture_figures(read_capture(file.path), file.path.name, centres)
+    with stored_capture(file.path, verify=False) as stored:
+        if stored is not None:
+            return capture_figures(stored.about, name, centres, stored)
+    return capture_figures(read_capture(file.path), name, centres)
 
 
 def _calibration(file: OpenedFile, choice: _Choice) -> Figures:
@@ -244,13 +247,13 @@ def _compared(files: Sequence[Path | str], truth: Path | str) -> Figures:
         )
     true = read_truth(truth, results[0])
     for file, result in zip(files, results):
-        if result.values.shape != true.shape:
+        if result.plane.shape != true.shape:
             raise InputError(
-                f"is a picture of {by(result.values.shape)}, the first of {by(true.shape)}",
+                f"is a picture of {by(result.plane.shape)}, the first of {by(true.shape)}",
                 file,
                 "compare pictures of one size",
             )
-    entries = [(r.method or r.name, r.values, f"{psnr(r.values, true):.2f} dB") for r in results]
+    entries = [(r.method or r.name, r.plane, f"{psnr(r.plane, true):.2f} dB") for r in results]
     figures = [(reconstructions(entries, true), "Each result above its error.")]
     block = read_block(results[0], truth)
     if block is not None and min(np.floor_divide(true.shape, block)) >= 2:

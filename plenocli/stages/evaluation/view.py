@@ -133,7 +133,7 @@ def _panels(found: Sequence[OpenedFile], choice: _Choice) -> list[Panel]:
 def _truth(truth: Path | str, result: Result) -> Any:
     from plenocli.files.results.truths import read_truth
 
-    true = read_truth(truth, result)
+    true = read_truth(truth, result).window()
     if true.shape != result.values.shape:
         raise UsageError(
             f"is a picture of {by(result.values.shape)}, its truth of {by(true.shape)}",

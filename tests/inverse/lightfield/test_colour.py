@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from plenocli.forward.sensor.capture import Capture, SuperpixelGrid
-from plenocli.forward.sensor.cfa import ColourProfile, cfa_map, preview
+from plenocli.forward.sensor.cfa import ColourProfile, cfa_map, colour_planes, preview
 from plenocli.inverse.calibration.calibration import Calibration, Response, Sensor, White, Windows
 from plenocli.inverse.lightfield.depth import depth
 from plenocli.inverse.lightfield.gather import samples_of, samples_of_spectra
@@ -155,7 +155,7 @@ def test_a_preview_has_the_colours_of_the_screen():
     colour = cfa_map((16, 16), "GRBG")
     mosaic = sum(np.where(colour == c, own[..., k], 0.0) for k, c in enumerate("RGB"))
     profile = ColourProfile(to_rgb=np.linalg.inv(mix), neutral=neutral)
-    found = preview(mosaic, "GRBG", profile)
+    found = preview(colour_planes(mosaic, "GRBG"), profile)
     assert found.shape == (8, 8, 3)
     assert np.allclose(found[::4, ::4].reshape(4, 3), true, atol=1e-9)
 

@@ -12,9 +12,6 @@ from plenocli.inverse.picture.estimators import Estimators, root_mean_square
 from plenocli.inverse.picture.lenslet_model import Superpixels
 from plenocli.inverse.spectra.lattice_system import LatticeSystem, PointPrior
 
-BORDER_STEPS = 4
-"""Solutions over all lenslets, of which the first is exact but at the array's border."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class JointEstimate:
@@ -74,12 +71,8 @@ def _even_light(
     variance = np.full(blocks.shape[1], data.known_sigma**2)
     lattice = LatticeSystem(blocks, system.offsets, variance, data.y.shape[:2], prior)
     left = data.y - mean * blocks.sum(axis=(0, 2))
-    found, seen = np.zeros((*data.y.shape[:2], count)), np.zeros_like(left)
-    for _ in range(BORDER_STEPS):
-        step = lattice.step(lattice.directions(left - seen), lattice.mirrored(found))
-        found = found + step
-        seen = lattice.forward(lattice.mirrored(found))
-    return found, seen
+    found = lattice.solved(left, np.zeros((*data.y.shape[:2], count)))
+    return found, lattice.forward(found)
 
 
 def own_light(estimators: Estimators, y: np.ndarray, x: np.ndarray) -> np.ndarray:

@@ -17,10 +17,6 @@ from plenocli.inverse.spectra.field_modes import EVEN
 from plenocli.inverse.spectra.lattice_system import LatticeSystem, PointPrior
 from plenocli.inverse.spectra.neighbours import NeighbourLight
 
-STEPS = 12
-"""Of a solution, at most: the border and lost pixels take more than one."""
-ENOUGH = 0.02
-"""Standard deviations by which the last step may still have moved an answer."""
 LEAST_CORRELATION = 0.05
 """Of lenslets beside each other, as the prior takes it."""
 MOST_CORRELATION = 0.98
@@ -149,8 +145,8 @@ def more_likely(capture: LatticeCapture, first: LatticeAnswer, second: LatticeAn
     shape = first.value.shape[:2]
     system = LatticeSystem(blocks, first.light.offsets, variance, shape, lenslets)
     value, left = _solved(system, capture, first.value)
-    one = system.surprise(left / scale, value, lenslets)
-    many = second.system.surprise(second.left / scale, second.points, points)
+    one = system.surprise(left, scale, value)
+    many = second.system.surprise(second.left, scale, second.points)
     return many < one
 
 
@@ -159,7 +155,7 @@ def neighbour_part(answer: LatticeAnswer, response: np.ndarray) -> np.ndarray:
     lenslet_column, pixel): without it a capture is as if all were alike.
     """
     system = answer.system
-    return system.forward(system.mirrored(answer.points)) - answer.value @ np.nan_to_num(response).T
+    return system.forward(answer.points) - answer.value @ np.nan_to_num(response).T
 
 
 def _coupled_system(capture: LatticeCapture, light: NeighbourLight) -> LatticeSystem:
@@ -181,30 +177,13 @@ def _stationary(capture: LatticeCapture, radiance: np.ndarray) -> np.ndarray:
 def _solved(
     system: LatticeSystem, capture: LatticeCapture, points: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(unknowns, what they leave of the superpixels, 0 where nothing is known): steps from `points`
-    until they are small beside the noise.
-    """
-    scale = np.sqrt(system.impulse[2]).min()
+    """(unknowns, what they leave of the superpixels, 0 where nothing is known), from a guess."""
     values = np.where(np.isfinite(capture.response).all(axis=-1), capture.values, 0)
-    seen, told = values, system.directions(np.nan_to_num(values))
-    for _ in range(STEPS):
-        if capture.own is not None:
-            seen = values - capture.own(_mean(system, points))
-            told = system.directions(np.nan_to_num(seen))
-        padded = system.mirrored(points)
-        step = system.step(system.left(told, padded, seen), padded)
-        points = points + step
-        if np.abs(_mean(system, step)).max() < ENOUGH * scale:
-            break
-    left = capture.values - system.forward(system.mirrored(points))
+    points = system.solved(values, points, capture.own)
+    left = capture.values - system.forward(points)
     if capture.own is not None:
-        left -= capture.own(_mean(system, points))
+        left -= capture.own(system.mean(points))
     return points, np.where(np.isfinite(left) & capture.known, left, 0)
-
-
-def _mean(system: LatticeSystem, points: np.ndarray) -> np.ndarray:
-    mean = system.modes.mean
-    return np.einsum("rcmk,m->rck", points.reshape(*points.shape[:2], len(mean), -1), mean)
 
 
 def _answer(
@@ -214,7 +193,7 @@ def _answer(
     left: np.ndarray,
     light: NeighbourLight,
 ) -> LatticeAnswer:
-    value, known = _mean(system, points), capture.known
+    value, known = system.mean(points), capture.known
     expected = capture.variance(value)
     count = known.sum(axis=-1)
     bands = value.shape[-1]
@@ -302,14 +281,13 @@ def _directions(
     """Normal equations of amounts of directions (direction, block, pixel, unknown) in which blocks
     may be changed, radiances eliminated.
     """
-    padded, variance = system.mirrored(points), _stationary(capture, points)
+    variance = _stationary(capture, points)
     seen, lines = np.ones(len(variance)), []
     weight = (capture.known / np.sqrt(variance)).astype(np.float32)
     for blocks in directions:
-        change = LatticeSystem(blocks, offsets, seen, system.shape).forward(padded)
+        change = LatticeSystem(blocks, offsets, seen, system.shape).forward(points)
         change *= capture.known
-        step = system.step(system.directions(change), padded)
-        change -= system.forward(system.mirrored(step))
+        change -= system.forward(system.answered(change))
         lines.append((change * weight).ravel())
     j, rest = np.array(lines), (left * weight).ravel()
     chi = max(1.0, float(rest @ rest) / max(int(np.count_nonzero(weight)), 1))

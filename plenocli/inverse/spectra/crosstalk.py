@@ -124,7 +124,7 @@ class Crosstalk:
 
     def _noiseless(self, answer: LatticeAnswer) -> np.ndarray:
         """The capture that an answer makes, as far as it was looked at."""
-        seen = answer.system.forward(answer.system.mirrored(answer.points))
+        seen = answer.system.forward(answer.points)
         if self.capture.own is not None:
             seen = seen + self.capture.own(answer.value)
         return np.where(np.isfinite(self.values), seen, np.nan).astype(np.float32)

@@ -1,12 +1,14 @@
 """Least squares over a lattice of lenslets that all answer alike: y_l = sum_o F_o b_(l-o) + noise.
 
-With stationary weights 1/v the normal equations are a convolution, and a Fourier transform over
-lenslets leaves one small system for each frequency. Beyond the array lenslets are taken to be
-mirrored. docs/model.md, section 9, "Neighbours".
+With stationary weights 1/v the normal equations are a convolution, whose Fourier transform leaves
+one small system for each frequency. What superpixels add to the unknowns fades within PAD lenslets,
+so that one inverse, at the frequencies of a tile, serves all tiles of an array. Beyond the array
+lenslets are taken to be mirrored. docs/model.md, section 9, "Neighbours".
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -14,14 +16,28 @@ import numpy as np
 
 from plenocli.inverse.spectra.field_modes import EVEN, FieldModes
 
-PAD = 4
-"""Mirrored lenslets on each side, at least."""
+PAD = 8
+"""Lenslets on each side by which an unknown is told: what those further away add is 0.1 of its
+standard deviation.
+"""
+TILE = 24
+"""Lenslets a side, without their PAD, that are solved at a time, at most."""
 IMPULSE = 16
 """Lenslets a side of the lattice on which what one pixel does to the answer is computed."""
+STEPS = 12
+"""Of a solution, at most: the border and lost pixels take more than one."""
+SETTLED, ENOUGH = 0.99, 0.05
+"""Share of the answers, and standard deviations by which the last step may have moved them."""
+REMEMBERED = 4
+"""Steps from which the next is made longer or shorter."""
 FAINT = 1e-4
 """Of the strongest direction of a superpixel, over the noise: fainter ones are not looked along."""
 UNTOLD = 1e-3
 """Variance that a direction has beforehand, over the noise's, below which it tells nothing."""
+EXACT = 24
+"""Unknowns up to which the inverse is of double precision: without a prior there may be some that
+light hardly tells apart.
+"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,21 +94,9 @@ class PointPrior:
     def _alike(self, apart: np.ndarray) -> np.ndarray:
         return np.power(float(self.rho), apart)
 
-    def pull(self, b: np.ndarray, precision: np.ndarray) -> np.ndarray:
-        """Precision times (mean - b), b (row, column, unknown) on a periodic lattice, as rfft2.
-
-        precision: at the frequencies of rfft2.
-        """
-        from scipy.fft import rfft2
-
-        apart = rfft2((self.even - b).astype(np.float32), axes=(0, 1))
-        found = precision @ apart.reshape(*apart.shape[:2], -1, len(self.mean)) @ self.inverse
-        return found.reshape(apart.shape)
-
 
 class LatticeSystem:
-    """The system of one array; arrays `inner` are (lenslet_row, lenslet_column, ...), padded ones
-    go on beyond.
+    """The system of one array; superpixels and unknowns are (lenslet_row, lenslet_column, ...).
 
     blocks: F_o (block, pixel, unknown).
     offsets: (block, 2), o: superpixels from the lenslet.
@@ -113,157 +117,204 @@ class LatticeSystem:
         from scipy.fft import next_fast_len
 
         self.offsets, self.shape, self.prior = offsets, shape, prior
+        self.reach = int(np.abs(offsets).max())
         self.unknowns = blocks.shape[-1]
         self.modes = EVEN if prior is None else prior.modes
-        self.padded = tuple(next_fast_len(n + 2 * PAD, real=True) for n in shape)
-        there = np.concatenate(list(blocks.swapaxes(1, 2)))
-        gram = (there / variance) @ there.T
-        self._there = there.astype(np.float32)
-        self._apart, self._products = _stencil(gram, offsets)
-        spread = np.ones(len(gram)) if prior is None else np.tile(prior.spread, len(offsets))
-        power, turn = np.linalg.eigh(spread[:, None] * gram * spread)
-        strong = power > (FAINT**2 * power[-1] if prior is None else UNTOLD)
-        turn, size = turn[:, strong], np.sqrt(power[strong])
-        self._seen = (turn * size / spread[:, None]).astype(np.float32)
-        self._look = (there.T / variance[:, None] @ (turn * spread[:, None] / size)).astype(
-            np.float32
+        self.tiles = tuple(-(-n // TILE) for n in shape)
+        self.tile = tuple(
+            next_fast_len(-(-n // k) + 2 * PAD, real=True) for n, k in zip(shape, self.tiles)
         )
+        self._variance = variance
+        self._there = np.concatenate(list(blocks.swapaxes(1, 2))).astype(np.float32)
+        even = np.zeros(self.unknowns) if prior is None else prior.even
+        self._even = even.astype(np.float32)
 
-    def mirrored(self, inner: np.ndarray) -> np.ndarray:
-        """Unknowns (rows, columns, unknown) as a padded array, object points mirrored."""
-        places, turned = zip(*(_beyond(n, size) for n, size in zip(self.shape, self.padded)))
-        x = inner[np.ix_(*places)]
-        if len(self.modes.kept) > 1:
-            x = x.reshape(*self.padded, len(self.modes.kept), -1)
-            down, across = self.modes.mirrored
-            x[turned[0]] = down @ x[turned[0]]
-            x[:, turned[1]] = across @ x[:, turned[1]]
-        return x.reshape(*self.padded, -1)
-
-    def inner(self, padded: np.ndarray) -> np.ndarray:
-        """The part of a padded array that is the lenslets'."""
-        return padded[PAD : PAD + self.shape[0], PAD : PAD + self.shape[1]]
-
-    def forward(self, b: np.ndarray) -> np.ndarray:
-        """Superpixels (rows, columns, pixel) float32 of padded unknowns."""
-        return self._gathered(b) @ self._there
+    @cached_property
+    def _along(self) -> tuple[np.ndarray, np.ndarray]:
+        """The few directions in which unknowns act on superpixels, of unit noise: what pixels tell
+        of them (pixel, direction), and what unknowns do to them (block * unknown, direction).
+        """
+        weight = 1 / np.sqrt(self._variance)
+        act = self._there.astype(float) * weight
+        strong = act
+        if self.prior is not None:
+            strong = act * np.tile(self.prior.spread, len(self.offsets))[:, None]
+        if len(act) < len(weight):
+            power, turn = np.linalg.eigh(strong @ strong.T)
+            turn = strong.T @ turn / np.sqrt(np.maximum(power, 1e-300))
+        else:
+            power, turn = np.linalg.eigh(strong.T @ strong)
+        turn = turn[:, power > (FAINT**2 * power[-1] if self.prior is None else UNTOLD)]
+        return (weight[:, None] * turn).astype(np.float32), (act @ turn).astype(np.float32)
 
     def directions(self, values: np.ndarray) -> np.ndarray:
-        """What superpixels (..., pixel) show along the few directions in which unknowns act on
-        them, of unit noise: (..., direction).
+        """What superpixels (..., pixel) show along the directions: (..., direction)."""
+        return values.astype(np.float32, copy=False) @ self._along[0]
+
+    def mean(self, b: np.ndarray) -> np.ndarray:
+        """Of the fields, (rows, columns, band), of unknowns."""
+        mean = self.modes.mean
+        return np.einsum("rcmk,m->rck", b.reshape(*b.shape[:2], len(mean), -1), mean)
+
+    def mirrored(self, b: np.ndarray, beyond: int) -> np.ndarray:
+        """Unknowns, and what they are up to `beyond` lenslets outside, object points mirrored."""
+        places, turned = zip(*(_mirror(n, beyond) for n in self.shape))
+        x = b[np.ix_(*places)]
+        if len(self.modes.kept) == 1:
+            return x
+        shape, x = x.shape, x.reshape(*x.shape[:2], len(self.modes.kept), -1)
+        down, across = (one.astype(x.dtype) for one in self.modes.mirrored)
+        x[turned[0]] = down @ x[turned[0]]
+        x[:, turned[1]] = across @ x[:, turned[1]]
+        return x.reshape(shape)
+
+    def forward(self, b: np.ndarray) -> np.ndarray:
+        """Superpixels (rows, columns, pixel) float32 of unknowns."""
+        return (
+            self._reaching(b, np.ones(self.shape, bool), 0).reshape(*self.shape, -1) @ self._there
+        )
+
+    def _reaching(self, b: np.ndarray, which: np.ndarray, beyond: int) -> np.ndarray:
+        """Unknowns that reach superpixels: (superpixel, block * unknown) float32.
+
+        which: (row, column) bool, of the array and `beyond` lenslets about it.
         """
-        return values.astype(np.float32, copy=False) @ self._look
-
-    def left(self, told: np.ndarray, b: np.ndarray, masked: np.ndarray) -> np.ndarray:
-        """What padded unknowns do not explain of directions (rows, columns, direction).
-
-        masked: (rows, columns, pixel) superpixels, NaN where they are not known; of those that
-            lack none `told` counts.
-        """
-        gathered = self._gathered(b)
-        out = told - gathered @ self._seen
-        some = np.isnan(masked).any(axis=-1)
-        if some.any():
-            out[some] = self.directions(np.nan_to_num(masked[some] - gathered[some] @ self._there))
-        return out
-
-    def _gathered(self, b: np.ndarray) -> np.ndarray:
-        """Padded unknowns that reach each superpixel: (rows, columns, block * unknown) float32."""
-        rows, columns = self.shape
-        out = np.empty((rows, columns, len(self.offsets), self.unknowns), np.float32)
+        wide = self.mirrored(b.astype(np.float32, copy=False), beyond + self.reach)
+        row, column = np.nonzero(which)
+        out = np.empty((len(row), len(self.offsets), self.unknowns), np.float32)
         for k, (down, across) in enumerate(self.offsets):
-            top, left = PAD - down, PAD - across
-            out[:, :, k] = b[top : top + rows, left : left + columns]
-        return out.reshape(rows, columns, -1)
+            out[:, k] = wide[row + self.reach - down, column + self.reach - across]
+        return out.reshape(len(row), -1)
 
-    def back(self, told: np.ndarray) -> np.ndarray:
-        """A^T V^-1 of superpixels by their directions, padded."""
-        rows, columns = self.shape
-        parts = told @ self._seen.T
-        parts = parts.reshape(rows, columns, len(self.offsets), self.unknowns)
-        out = np.zeros((*self.padded, self.unknowns))
-        for k, (down, across) in enumerate(self.offsets):
-            top, left = PAD - down, PAD - across
-            out[top : top + rows, left : left + columns] += parts[:, :, k]
-        return out
+    def solved(
+        self,
+        values: np.ndarray,
+        start: np.ndarray,
+        own: Callable[[np.ndarray], np.ndarray] | None = None,
+    ) -> np.ndarray:
+        """Unknowns from superpixels. What is not seen, beyond the border and where pixels are lost,
+        counts as the unknowns foretell it, until that moves them no more.
 
-    def normal(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-        """A^T V^-1 A and the prior's precision at frequencies, radians a lenslet.
-
-        Returns (len(rows), len(columns), unknown, unknown) complex64.
+        values: (rows, columns, pixel), NaN where lost.
+        start: a first guess.
+        own: from means, what superpixels have beside `forward`; None: nothing.
         """
-        out = self._information(rows, columns)
-        if self.prior is None:
+        scale, grid = np.sqrt(self.impulse[2]).min(), tuple(n + 2 * PAD for n in self.shape)
+        lost = np.isnan(values).any(axis=-1)
+        foretold, inside = np.ones(grid, bool), (slice(PAD, -PAD),) * 2
+        foretold[inside] = lost
+        act = self._along[1]
+        even = np.tile(self._even, len(self.offsets)) @ act
+        whole = np.pad(self.directions(np.nan_to_num(values)) - even, [(PAD, PAD)] * 2 + [(0, 0)])
+
+        def told(b: np.ndarray) -> np.ndarray:
+            out, seen = whole.copy(), values
+            if own is not None:
+                seen = values - own(self.mean(b))
+                out[inside] = self.directions(np.nan_to_num(seen)) - even
+            out[foretold] = self._reaching(b - self._even, foretold, PAD) @ act
+            if lost.any():
+                apart = seen[lost] - self._reaching(b, lost, 0) @ self._there
+                out[inside][lost] += self.directions(np.nan_to_num(apart))
             return out
-        before = self.prior.precision(rows, columns).astype(np.complex64)
-        return out + np.kron(before, self.prior.inverse.astype(np.float32))
 
-    def _information(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-        phases = [
-            np.exp(-1j * np.multiply.outer(k, self._apart[:, axis]))
-            for axis, k in enumerate((rows, columns))
-        ]
-        phase = (phases[0][:, None] * phases[1][None]).astype(np.complex64)
-        out = phase @ self._products.reshape(len(self._apart), -1)
-        return out.reshape(len(rows), len(columns), self.unknowns, self.unknowns)
+        known = told(start)
+        b = self._even + self._answered(known)
+        changing = foretold if own is None else np.ones(grid, bool)
+        steps = _Steps()
+        for _ in range(STEPS):
+            change = np.zeros_like(known)
+            change[changing] = steps.next(known[changing], (told(b) - known)[changing])
+            step = self._answered(change)
+            known, b = known + change, b + step
+            if np.quantile(np.abs(self.mean(step)), SETTLED) < ENOUGH * scale:
+                break
+        return b
 
-    @property
-    def _frequencies(self) -> tuple[np.ndarray, np.ndarray]:
-        rows, columns = self.padded
-        return 2 * np.pi * np.fft.fftfreq(rows), 2 * np.pi * np.fft.rfftfreq(columns)
+    def answered(self, values: np.ndarray) -> np.ndarray:
+        """Unknowns, off their mean, from superpixels off theirs, where those outside are not."""
+        return self._answered(np.pad(self.directions(values), [(PAD, PAD)] * 2 + [(0, 0)]))
 
-    @cached_property
-    def _inverse(self) -> np.ndarray:
-        """Of `normal`, at the frequencies of the padded array: every step takes it, and what its
-        rounding leaves, the next one finds.
+    def _answered(self, told: np.ndarray) -> np.ndarray:
+        """Unknowns by what directions tell, (row, column, direction) of the array and PAD about it,
+        tile by tile.
         """
-        return _inverted(self.normal(*self._frequencies))
-
-    @cached_property
-    def _before(self) -> np.ndarray | None:
-        """The prior's precision at the same frequencies."""
-        if self.prior is None:
-            return None
-        return self.prior.precision(*self._frequencies).astype(np.complex64)
-
-    def solve(self, right: np.ndarray, pull: np.ndarray | float = 0.0) -> np.ndarray:
-        """N^-1 of a padded array, and of what is added to its spectrum."""
         from scipy.fft import irfft2, rfft2
 
-        spectrum = rfft2(right.astype(np.float32), axes=(0, 1)) + pull
-        found = (self._inverse @ spectrum[..., None])[..., 0]
-        return irfft2(found, s=self.padded, axes=(0, 1)).astype(float)
+        inner = [n - 2 * PAD for n in self.tile]
+        wide = np.zeros(
+            (*(n * k + 2 * PAD for n, k in zip(inner, self.tiles)), told.shape[-1]), np.float32
+        )
+        wide[: told.shape[0], : told.shape[1]] = told
+        corners = [
+            (row, column)
+            for row in range(0, wide.shape[0] - 2 * PAD, inner[0])
+            for column in range(0, wide.shape[1] - 2 * PAD, inner[1])
+        ]
+        parts = [wide[r : r + self.tile[0], c : c + self.tile[1]] for r, c in corners]
+        some = [k for k, part in enumerate(parts) if part.any()]
+        out = np.zeros((*(n * k for n, k in zip(inner, self.tiles)), self.unknowns), np.float32)
+        if some:
+            spectrum = rfft2(np.stack([parts[k] for k in some], axis=2), axes=(0, 1))
+            found = irfft2(spectrum @ self._gain, s=self.tile, axes=(0, 1))[PAD:-PAD, PAD:-PAD]
+            for place, k in enumerate(some):
+                row, column = corners[k]
+                out[row : row + inner[0], column : column + inner[1]] = found[:, :, place]
+        return out[: self.shape[0], : self.shape[1]]
 
-    def step(self, left: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """What unknowns b, padded, lack: inner.
-
-        left: of the superpixels' directions.
+    def _acts(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        """What unknowns do to directions at frequencies, radians a lenslet: (len(rows),
+        len(columns), unknown, direction).
         """
-        pull: np.ndarray | float = 0.0
-        if self.prior is not None and self._before is not None:
-            pull = self.prior.pull(b, self._before)
-        return self.inner(self.solve(self.back(left), pull))
+        phases = [
+            np.exp(-1j * np.multiply.outer(k, self.offsets[:, axis]))
+            for axis, k in enumerate((rows, columns))
+        ]
+        phase, act = phases[0][:, None] * phases[1][None], self._along[1]
+        if self.unknowns > EXACT:
+            phase = phase.astype(np.complex64)
+        out = phase @ act.reshape(len(self.offsets), -1)
+        return out.reshape(len(rows), len(columns), self.unknowns, -1)
 
-    def surprise(self, left: np.ndarray, points: np.ndarray, prior: PointPrior) -> float:
+    def _normal(self, acts: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        """A^T V^-1 A and the prior's precision: (len(rows), len(columns), unknown, unknown)."""
+        out = acts.conj() @ acts.swapaxes(-1, -2)
+        if self.prior is not None:
+            before = self.prior.precision(rows, columns)
+            out += np.kron(before, self.prior.inverse).astype(out.dtype)
+        return out
+
+    @cached_property
+    def _gain(self) -> np.ndarray:
+        """Unknowns from directions at the frequencies of a tile: (row, column, direction, unknown)
+        complex64.
+        """
+        rows, columns = self.tile
+        frequencies = 2 * np.pi * np.fft.fftfreq(rows), 2 * np.pi * np.fft.rfftfreq(columns)
+        acts = self._acts(*frequencies)
+        gain = _inverted(self._normal(acts, *frequencies)) @ acts.conj()
+        return np.ascontiguousarray(gain.swapaxes(-1, -2), np.complex64)
+
+    def surprise(self, left: np.ndarray, scale: np.ndarray, b: np.ndarray) -> float:
         """-2 ln of the evidence a lenslet (but for what all systems of a capture share): what is
         left over of the data, how far the answer is from its prior, and how much of the prior the
         data rule out.
 
-        left: of the superpixels, over the noise's standard deviation.
-        points: the answer, inner.
-        prior: the system's, or one for a system that was solved without.
+        left: of the superpixels.
+        scale: (pixel,), its standard deviation.
+        b: the answer.
         """
-        from scipy.fft import irfft2
-
         frequency = 2 * np.pi * np.fft.fftfreq(IMPULSE)
-        before = np.kron(prior.precision(frequency, frequency), prior.inverse)
-        after = self._information(frequency, frequency) + before
+        assert self.prior is not None
+        before = np.kron(self.prior.precision(frequency, frequency), self.prior.inverse)
+        acts = self._acts(frequency, frequency)
+        after = self._normal(acts, frequency, frequency)
         ruled_out = np.linalg.slogdet(after)[1] - np.linalg.slogdet(before)[1]
-        pulled = prior.pull(self.mirrored(points), prior.precision(*self._frequencies))
-        pull = self.inner(irfft2(pulled, s=self.padded, axes=(0, 1)))
-        apart = points - prior.even
+        apart = self._reaching(b - self._even, np.ones(self.shape, bool), 0) @ self._along[1]
+        # the answer is where its prior pulls as much as what is left
+        pulled = (self.directions(left).reshape(apart.shape) * apart).sum()
         lenslets = self.shape[0] * self.shape[1]
-        return float(((left**2).sum() - (apart * pull).sum()) / lenslets + ruled_out.mean())
+        return float((((left / scale) ** 2).sum() + pulled) / lenslets + ruled_out.mean())
 
     @cached_property
     def impulse(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -273,22 +324,44 @@ class LatticeSystem:
         the noise of variance v.
         """
         frequency = 2 * np.pi * np.fft.fftfreq(IMPULSE)
-        normal = self.normal(frequency, frequency)
+        acts = self._acts(frequency, frequency)
+        normal = self._normal(acts, frequency, frequency)
         bands = self.unknowns // len(self.modes.kept)
         mean = np.kron(self.modes.mean[:, None], np.eye(bands))
         turned = np.linalg.solve(normal, np.broadcast_to(mean, (*normal.shape[:3], bands)))
         posterior = np.einsum("dk,rcdk->k", mean, turned).real / IMPULSE**2
-        spread = np.fft.ifft2(turned, axes=(0, 1)).real  # (row, column, unknown, band)
-        reach = int(np.abs(self.offsets).max()) + 1
-        back = (self._look @ self._seen.T).reshape(len(self._look), len(self.offsets), -1)
-        near = range(-reach, reach + 1)
+        spread = np.fft.ifft2(turned.swapaxes(-1, -2) @ acts, axes=(0, 1)).real
+        near = range(-self.reach - 1, self.reach + 2)
         where = np.array([(i, j) for i in near for j in near])
-        h = np.zeros((len(where), bands, len(self._look)))
-        for d, (i, j) in enumerate(where):
-            for k, (down, across) in enumerate(self.offsets):
-                at = spread[(i - down) % IMPULSE, (j - across) % IMPULSE]
-                h[d] += (back[:, k] @ at).T
+        h = spread[where[:, 0] % IMPULSE, where[:, 1] % IMPULSE] @ self._along[0].T
         return where, h, posterior
+
+
+class _Steps:
+    """Longer or shorter steps towards where none is left: the combination of the last ones that
+    leaves least (D. G. Anderson, J. ACM 12, 547, 1965).
+    """
+
+    def __init__(self) -> None:
+        """Nothing is remembered."""
+        self._past: list[tuple[np.ndarray, np.ndarray]] = []
+
+    def next(self, place: np.ndarray, step: np.ndarray) -> np.ndarray:
+        """The step to take.
+
+        place: where it starts.
+        step: the plain one from there.
+        """
+        past, now = self._past[-REMEMBERED:], (place, step)
+        self._past = [*past, now]
+        if not past:
+            return step
+        moved, apart = (np.array([now[k] - one[k] for one in past]) for k in (0, 1))
+        flat = apart.reshape(len(past), -1)
+        normal = flat @ flat.T
+        normal += 1e-6 * np.trace(normal) * np.eye(len(past))
+        share = np.linalg.solve(normal, flat @ step.ravel())
+        return step - np.tensordot(share, moved + apart, 1).astype(step.dtype)
 
 
 def _inverted(normal: np.ndarray) -> np.ndarray:
@@ -299,28 +372,13 @@ def _inverted(normal: np.ndarray) -> np.ndarray:
         # unknowns that light does not tell apart, as of two bands alike: rounding alone is left
         size = np.trace(normal, axis1=2, axis2=3).real[..., None, None]
         least = 4 * np.finfo(np.float32).eps * size * np.eye(normal.shape[-1])
-        return np.linalg.inv(normal + least.astype(np.float32))
+        return np.linalg.inv(normal + least.astype(normal.real.dtype))
 
 
-def _beyond(count: int, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Which of `count` lenslets stands at each of `size` places from PAD before the first on, and
-    whether it is mirrored there.
+def _mirror(count: int, beyond: int) -> tuple[np.ndarray, np.ndarray]:
+    """Which of `count` lenslets stands at each place from `beyond` before the first to as many
+    after the last, and whether it is mirrored there.
     """
-    place = np.arange(-PAD, size - PAD) % (2 * count)
+    place = np.arange(-beyond, count + beyond) % (2 * count)
     turned = place >= count
     return np.where(turned, 2 * count - 1 - place, place), turned
-
-
-def _stencil(gram: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A^T V^-1 A as a stencil: lenslets apart (n, 2), and (n, unknown, unknown) complex64.
-
-    gram: (block * unknown, block * unknown).
-    """
-    apart, which = np.unique(
-        (offsets[None] - offsets[:, None]).reshape(-1, 2), axis=0, return_inverse=True
-    )
-    count = len(offsets)
-    products = gram.reshape(count, len(gram) // count, count, -1).swapaxes(1, 2)
-    out = np.zeros((len(apart), *products.shape[2:]), np.complex64)
-    np.add.at(out, which.ravel(), products.reshape(-1, *products.shape[2:]))
-    return apart, out

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from plenocli.forward.sensor.noise import Noise
+from plenocli.inverse.spectra import lattice_system
 from plenocli.inverse.spectra.coupled import LatticeCapture, coupled, fine, more_likely
 from plenocli.inverse.spectra.field_modes import FieldModes, field_modes
-from plenocli.inverse.spectra.lattice_system import PAD, UNTOLD, LatticeSystem, PointPrior
+from plenocli.inverse.spectra.lattice_system import UNTOLD, LatticeSystem, PointPrior
 from plenocli.inverse.spectra.neighbours import NeighbourLight
 
 BANDS, SIDE, POINTS = 2, 6, 3
@@ -81,9 +82,9 @@ def each_its_own(shape, seed=2):
     return np.repeat(b, POINTS**2, axis=2)
 
 
-def dense(system, blocks):
-    """A on the periodic padded lattice, all lenslets' pixels by all lenslets' unknowns."""
-    rows, columns = system.padded
+def dense(shape, blocks):
+    """A on a periodic lattice, all lenslets' pixels by all lenslets' unknowns."""
+    rows, columns = shape
     A = np.zeros((rows, columns, PIXELS, rows, columns, blocks.shape[-1]))
     for row in range(rows):
         for column in range(columns):
@@ -111,34 +112,51 @@ def along_the_ring(prior, shape):
 
 
 @pytest.mark.parametrize("points", [1, POINTS])
-def test_one_solve_a_frequency_is_the_dense_solution(points):
+def test_one_solve_a_frequency_is_the_dense_solution(points, monkeypatch):
+    """On a ring of which all but two lenslets see nothing but the mean."""
+    monkeypatch.setattr(lattice_system, "PAD", 4)
     light = lattice_light()
     blocks = light.light.sum(axis=2) if points == 1 else light.light.reshape(9, PIXELS, -1)
     variance = np.random.default_rng(5).uniform(200, 900, PIXELS)
     prior = PointPrior(mean=np.full(BANDS, 0.4), inverse=np.diag([30.0, 50.0]), rho=0.6, modes=ALL)
     system = LatticeSystem(blocks, OFFSETS, variance, (2, 1), None if points == 1 else prior)
-    A = dense(system, blocks)
-    lenslets = int(np.prod(system.padded))
-    weighted = A / np.tile(variance, lenslets)[:, None]
+    assert system.tile == (10, 9)
+    A = dense(system.tile, blocks)
+    weighted = A / np.tile(variance, 90)[:, None]
     normal = A.T @ weighted
-    rng = np.random.default_rng(6)
-    b = rng.uniform(0, 1, (*system.padded, blocks.shape[-1]))
-    values = rng.normal(0, 300, (2, 1, PIXELS))
-    whole = np.zeros((*system.padded, PIXELS))
-    whole[PAD : PAD + 2, PAD : PAD + 1] = values
-    right = (whole.ravel() @ weighted).reshape(b.shape)
-    found, faint = system.back(system.directions(values)), 2e-4 * np.abs(right).max()
-    apart, noises = np.abs(found - right), np.linalg.norm(values / np.sqrt(variance), axis=-1)
-    if points > 1:  # what tells next to nothing of the prior's spread is not looked at
-        assert (apart * prior.spread).max() < 3 * np.sqrt(UNTOLD) * noises.max()
-    else:
-        assert apart.max() < faint
-    ours = (A @ b.ravel()).reshape(*system.padded, PIXELS)
-    np.testing.assert_allclose(system.forward(b), system.inner(ours), rtol=1e-4)
     if points > 1:
-        normal = normal + along_the_ring(prior, system.padded)
-    expected = np.linalg.solve(normal, right.ravel()).reshape(b.shape)
-    np.testing.assert_allclose(system.solve(right), expected, atol=2e-4 * np.abs(expected).max())
+        normal = normal + along_the_ring(prior, system.tile)
+    values = np.random.default_rng(6).normal(0, 300, (2, 1, PIXELS))
+    whole = np.zeros((*system.tile, PIXELS))
+    whole[4:6, 4:5] = values
+    expected = np.linalg.solve(normal, whole.ravel() @ weighted).reshape(*system.tile, -1)[4:6, 4:5]
+    apart = np.abs(system.answered(values) - expected)
+    faint = 2e-4 * np.abs(expected).max()
+    # what tells next to nothing of the prior's spread is not looked at
+    assert apart.max() < (faint if points == 1 else 3 * np.sqrt(UNTOLD) * prior.spread.max())
+
+
+@pytest.mark.parametrize("shape", [(7, 5), (30, 9)])
+def test_superpixels_come_back_to_the_border_whatever_the_tiles(shape, monkeypatch):
+    """Of noiseless superpixels of mirrored lenslets, by a loop; tiles do not show."""
+    light, rng = lattice_light(), np.random.default_rng(12)
+    blocks = light.light.reshape(9, PIXELS, -1)
+    points = rng.uniform(0.1, 0.8, (*shape, POINTS**2, BANDS))
+    values, variance = seen(light, points), rng.uniform(200, 900, PIXELS)
+    prior = PointPrior(mean=np.full(BANDS, 0.4), inverse=np.diag([30.0, 50.0]), rho=0.6, modes=ALL)
+    system = LatticeSystem(blocks, OFFSETS, variance, shape, prior)
+    np.testing.assert_allclose(system.forward(points.reshape(*shape, -1)), values, rtol=1e-5)
+    first = np.full((*shape, POINTS**2 * BANDS), 0.4)
+    found = system.solved(values, first)
+    monkeypatch.setattr(lattice_system, "TILE", 8)
+    tiled = LatticeSystem(blocks, OFFSETS, variance, shape, prior).solved(values, first)
+    scale = np.sqrt(system.impulse[2])
+    assert (np.abs(system.mean(tiled - found)) / scale).max() < 0.2
+    left = (values - system.forward(found)) / np.sqrt(variance)
+    away = (values - values.mean(axis=(0, 1))) / np.sqrt(variance)
+    assert np.sqrt((away**2).mean()) > 9
+    for part in (left, left[0], left[:, -1]):  # the prior pulls by less than the noise
+        assert np.sqrt((part**2).mean()) < 0.5
 
 
 def test_the_prior_is_an_exponential_correlation_of_points():
@@ -154,17 +172,6 @@ def test_the_prior_is_an_exponential_correlation_of_points():
     for place, lags in zip([(0, 0), (0, 1), (1, 1)], middle):
         expected = [0.25 * 0.5 ** (abs(i) + abs(j)) for i, j in lags]
         np.testing.assert_allclose(covariance[place], expected, rtol=2e-3)
-
-
-def test_pull_is_the_precision_of_what_is_off_the_mean():
-    prior = PointPrior(mean=np.full(BANDS, 0.4), inverse=np.diag([30.0, 50.0]), rho=0.6, modes=ALL)
-    shape, rng = (6, 5), np.random.default_rng(11)
-    b = rng.uniform(0, 1, (*shape, POINTS**2 * BANDS))
-    frequencies = [2 * np.pi * f for f in (np.fft.fftfreq(6), np.fft.rfftfreq(5))]
-    pulled = np.fft.irfft2(prior.pull(b, prior.precision(*frequencies)), s=shape, axes=(0, 1))
-    expected = along_the_ring(prior, shape) @ (0.4 - b).ravel()
-    apart = np.abs(pulled.ravel() - expected).max()
-    assert apart < 1e-3 * np.abs(expected).max()
 
 
 def edge_lit(side=9, pixels=12):

@@ -110,6 +110,11 @@ GIVEN = {
     },
     "learn-dict --pif pif.h5 --resume": {"dictionary.h5": "learnt.h5"},
     "volume capture.h5": {"capture.h5": "volume-capture.h5"},
+    "volume red.h5": {
+        "red.h5": "volume-capture.h5",
+        "kernels-red.h5": "kernels.h5",
+        "green-volume.h5": "volume.h5",
+    },
     "score spectra.h5": {"capture.h5": "shown.h5", "spectra.h5": "shown-spectra.h5"},
     "score shown.h5": {"camera.toml": "colour.toml", "shown.h5": "shown-spectra.h5"},
     "score planes.h5": {"planes.h5": "distances.h5"},

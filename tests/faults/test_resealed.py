@@ -19,6 +19,7 @@ BY_DICTIONARY = "reconstruct capture.h5 --pif pif.h5 --method dictionary --dicti
 SIMULATE = "capture-sim camera.toml --pif X --scene photo.png -o o.h5"
 RESUME = "learn-dict photo.png --pif pif.h5 --resume X --iterations 3 -o o.h5"
 VOLUME = "volume volume-capture.h5 --pif X -o o.h5"
+TIED = "volume volume-capture.h5 --pif kernels.h5 --like X -o o.h5"
 AXES = {"CLASS", "NAME", "DIMENSION_LIST", "REFERENCE_LIST"}
 SCORE = "score X --truth capture.h5 -o o.json"
 
@@ -140,6 +141,9 @@ IMPOSSIBLE = [
         "show X -o o.png",
         values("stack/lenslet_offset", lambda v: np.full_like(v, -(2**31))),
     ),
+    ("volume.h5", TIED, values("volume/depth", lambda v: v * 1e-300)),
+    ("volume.h5", TIED, values("volume/spacing", lambda v: v * 3)),
+    ("volume.h5", TIED, other("volume/value", lambda v: v[:, :1])),
     ("dictionary.h5", RESUME, other("dictionary/state/iteration", lambda v: np.zeros(0))),
     ("dictionary.h5", RESUME, values("dictionary/state/iteration", lambda v: v * 0 - 1)),
     ("fit.h5", "show X -o o.png", values("fit/tolerance", lambda v: v * 0)),

@@ -11,9 +11,10 @@ import pytest
 import tifffile
 from PIL import Image
 
-from plenocli.base.errors import ConfigError, InputError, NumericsError, UsageError
+from plenocli.base.errors import ConfigError, InputError, NumericsError, OutputError, UsageError
 from plenocli.base.progress import collected_notes
 from plenocli.cli.sections import read_options
+from plenocli.files.artefacts.container import read_artefact, write_artefact
 from plenocli.files.images.mosaic import read_capture
 from plenocli.files.images.tiff_stack import read_tiff_volume, write_volume_tiff
 from plenocli.files.results.stacks import read_stack
@@ -182,6 +183,105 @@ def test_a_specimen_comes_back_and_says_how_well(seen, tmp_path, method):
     assert np.array_equal(found.value, same.value)
     if method == "auto":
         assert {what for what, _ in report.tried} >= {"rl", "lmmse", "tv"}
+
+
+def test_a_noisy_colour_is_tied_to_a_clear_one(camera, seen, tmp_path):
+    """By the kernels of its own wavelength; through files, and the file says how much it is tied.
+    What it is tied to, if that is less clear, is told.
+    """
+    red = tmp_path / "red.toml"
+    red.write_text(MICROSCOPE.replace("500 nm", "600 nm"))
+    run_capture_sim(
+        red,
+        tmp_path / "red.h5",
+        Capture(snr_db=20, refine=2, accuracy=2e-2, seed=5),
+        volume=str(seen / "truth.h5"),
+    )
+    run_simulate_pif(red, tmp_path / "kernels.h5", Settings(accuracy=2e-2))
+    run_volume(seen / "capture.h5", tmp_path / "clear.h5", seen / "stack.h5", method="tv")
+    found = {}
+    for name, like in {"alone": None, "tied": tmp_path / "clear.h5"}.items():
+        with collected_notes() as notes:
+            report = run_volume(
+                tmp_path / "red.h5",
+                tmp_path / f"{name}.h5",
+                tmp_path / "kernels.h5",
+                method="auto" if like else "tv",
+                like=like,
+            )
+        assert not any("tie that volume" in note for note in notes)
+        found[name] = (
+            run_score(
+                [tmp_path / f"{name}.h5"],
+                tmp_path / "s.json",
+                truth=seen / "truth.h5",
+                overwrite=True,
+            )
+            .results[0]
+            .figures["volume_snr_db"]
+        )
+    assert found["tied"] > found["alone"] + 0.3
+    facts = read_volume(tmp_path / "tied.h5").facts
+    assert facts["like_factor"] == report.like_factor > 0.3 and facts["method"] == "tv"
+    assert facts["like_share"] == report.like_share > 0.1
+    assert "of the other volume is" in report.line()
+    assert "like_factor" not in read_volume(tmp_path / "alone.h5").facts
+    with collected_notes() as notes:
+        run_volume(
+            seen / "capture.h5", tmp_path / "c.h5", seen / "stack.h5", like=tmp_path / "alone.h5"
+        )
+    assert any("tie that volume to this one" in note for note in notes)
+
+
+@pytest.fixture(scope="module")
+def clear(seen, tmp_path_factory):
+    path = tmp_path_factory.mktemp("clear") / "clear.h5"
+    run_volume(seen / "capture.h5", path, seen / "stack.h5", method="tv")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"value": lambda v: v[:, :-2]}, "is not on those of the kernels"),
+        ({"value": lambda v: v[1:], "depth": lambda d: d[1:]}, "is not on those of the kernels"),
+        ({"depth": lambda d: d + 1e-6}, "is not on those of the kernels"),
+        ({"spacing": lambda s: 1.1 * s}, "of another size"),
+    ],
+)
+def test_a_volume_of_other_voxels_ties_nothing(seen, clear, tmp_path, change, said):
+    made = read_artefact(clear, "volume")
+    for name in ("value", "spacing", "depth"):
+        made.data[f"volume/{name}"] = change.get(name, lambda v: v)(made.data[f"volume/{name}"])
+    if "depth" in change and "value" in change:
+        made.data["volume/spacing"] = made.data["volume/spacing"][1:]
+    write_artefact(tmp_path / "other.h5", made)
+    with pytest.raises(InputError, match=said):
+        run_volume(
+            seen / "capture.h5", tmp_path / "v.h5", seen / "stack.h5", like=tmp_path / "other.h5"
+        )
+    assert not (tmp_path / "v.h5").exists()
+
+
+def test_what_ties_no_volumes_is_refused(seen, clear, tmp_path):
+    for error, method, like, output in (
+        (UsageError, "rl", clear, "v.h5"),
+        (InputError, "tv", seen / "capture.h5", "v.h5"),
+        (InputError, "tv", seen / "none.h5", "v.h5"),
+        (OutputError, "tv", tmp_path / "own.h5", "own.h5"),
+    ):
+        (tmp_path / "own.h5").write_bytes(clear.read_bytes())
+        with pytest.raises(error):
+            run_volume(
+                seen / "capture.h5",
+                tmp_path / output,
+                seen / "stack.h5",
+                method=method,
+                like=like,
+                overwrite=True,
+            )
+        assert (tmp_path / "own.h5").read_bytes() == clear.read_bytes()
+        assert not (tmp_path / "v.h5").exists()
 
 
 def test_kernels_that_do_not_explain_a_capture_are_told(camera, seen, tmp_path):

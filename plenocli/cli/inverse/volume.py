@@ -74,6 +74,14 @@ class _Background(click.ParamType):
     help="Pixels of a colour sensor that are taken; each colour makes a volume of its own.",
 )
 @click.option(
+    "--like",
+    type=options.FILE,
+    help=(
+        "Volume (.h5) of another colour of the specimen, on the same voxels and clearer than this "
+        "one, whose structure it may share; by total variation of what is not in the other."
+    ),
+)
+@click.option(
     "--device",
     type=click.Choice(["cpu", "cuda"]),
     default="cpu",
@@ -97,6 +105,7 @@ def command(
     background: float | Literal["auto"],
     most_planes: int | None,
     channel: str | None,
+    like: Path | None,
     device: str,
     output: Path,
     seed: int,
@@ -112,6 +121,7 @@ def command(
       plenocli volume capture.h5 --pif kernels.h5 -o volume.h5
       plenocli volume light_field.tif --pif kernels.h5 --calibration grid.h5 \\
           --method lmmse -o volume.ome.tif
+      plenocli volume red.h5 --pif kernels-red.h5 --like green-volume.h5 -o red-volume.h5
     """
     from plenocli.stages.inverse.volume import run_volume
 
@@ -125,6 +135,7 @@ def command(
         background=background,
         most_planes=most_planes,
         channel=channel,
+        like=like,
         device=device,
         overwrite=overwrite,
         seed=seed,

@@ -8,12 +8,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from plenocli.base.errors import InputError
 from plenocli.evaluation.metrics.volume import VolumeScore, score_volume
 
 if TYPE_CHECKING:
     from plenocli.files.artefacts.container import Artefact
     from plenocli.files.artefacts.provenance import Provenance
+    from plenocli.forward.volume.stack import Stack
     from plenocli.inverse.volume.volume import Volume
+
+SAME = 1e-3
+"""Share of a size by which voxels may differ that are the same ones."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,6 +107,8 @@ def volume_artefact(
             "noise_variance": volume.prior.noise_variance,
         }
     made.attrs["volume"] = about
+    if volume.likeness is not None:
+        about |= {"like_factor": volume.likeness.factor, "like_share": volume.likeness.share}
     if volume.held_out is not None:
         from plenocli.inverse.volume.volume import all_known
 
@@ -128,6 +135,32 @@ def read_volume(path: Path | str) -> StoredVolume:
     from plenocli.files.artefacts.container import read_artefact
 
     return volume_of(read_artefact(path, "volume"))
+
+
+def same_voxels(
+    volume: StoredVolume, stack: Stack, lenslets: tuple[int, int], path: Path | str
+) -> np.ndarray:
+    """A volume on the voxels of kernels before `lenslets` cells: (plane, row, column), of its
+    planes those that the kernels have.
+
+    Raises InputError, which names `path`, where it has other voxels.
+    """
+    depth, value = stack.depth, volume.value
+    away = np.abs(volume.depth - depth[:, None])
+    nearest = away.argmin(axis=1)
+    rows, columns = (n * s for n, s in zip(lenslets, stack.point_shape))
+    close = SAME * (np.ptp(depth) + stack.spacing.min())
+    if value.shape[1:] != (rows, columns) or away[range(len(depth)), nearest].max() > close:
+        raise InputError(
+            f"a volume of {len(value)} planes of {value.shape[1]} x {value.shape[2]} voxels is not "
+            f"on those of the kernels, {len(depth)} planes of {rows} x {columns}",
+            path,
+            "name one that was made with kernels of the same planes and points",
+        )
+    same_size = np.allclose(volume.spacing, stack.spacing.mean(axis=0), rtol=SAME)
+    if len(value) == len(depth) and not same_size:
+        raise InputError("its voxels are of another size than those of the kernels", path)
+    return value[nearest]
 
 
 def volume_of(artefact: Artefact) -> StoredVolume:

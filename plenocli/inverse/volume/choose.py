@@ -8,6 +8,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 
+import numpy as np
+
 from plenocli.base.errors import NumericsError
 from plenocli.base.progress import bar
 from plenocli.inverse.volume.lmmse import is_uneven, lmmse
@@ -31,15 +33,19 @@ WORTH = 0.05
 """Share of the misfit that a further plane must take away."""
 
 
-def volume_of(problem: Problem, method: str = "auto") -> Volume:
+def volume_of(problem: Problem, method: str = "auto", like: np.ndarray | None = None) -> Volume:
     """The volume behind a measurement.
 
     problem: the measurement before its map.
     method: one of SOLVERS, or "auto": of COMPARED the one whose held-out pixels are predicted best.
+    like: (plane, row, column) a volume of another colour that total variation, then the method of
+        "auto", may tie this one to.
 
     Returns the volume; of "auto" its trace begins with what each method predicted.
     Raises KeyError for a method that is none, NumericsError where "auto" has nothing to judge by.
     """
+    if like is not None:
+        return total_variation(problem, like=like)
     if method != "auto":
         return SOLVERS[method](problem)
     if not problem.held.any():
@@ -57,10 +63,14 @@ def volume_of(problem: Problem, method: str = "auto") -> Volume:
     return replace(best, trace=(*tried, *best.trace))
 
 
-def volume_like(problem: Problem, other: Volume) -> Volume:
+def volume_of_part(problem: Problem, other: Volume, like: np.ndarray | None = None) -> Volume:
     """The volume behind another part of the same specimen, by the method of `other`; its error bars
     follow the specimen where those of `other` do, else they would jump from part to part.
+
+    like: as in volume_of, of this part.
     """
+    if like is not None:
+        return volume_of(problem, other.method, like)
     linear = {} if other.sigma is None else {"uneven": is_uneven(other.value)}
     return SOLVERS[other.method](problem, **linear)
 

@@ -8,6 +8,7 @@ from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -16,11 +17,12 @@ from plenocli.base.device import CPU, Device
 from plenocli.base.linear_maps import BlockCirculant, torus_for
 from plenocli.base.progress import bar
 from plenocli.forward.volume.stack import Stack
-from plenocli.inverse.volume.choose import volume_like, volume_of
+from plenocli.inverse.volume import total_variation
+from plenocli.inverse.volume.choose import volume_of, volume_of_part
 from plenocli.inverse.volume.haze import haze, without_haze
 from plenocli.inverse.volume.lattice import map_of, voxels_of
 from plenocli.inverse.volume.measurement import SEEN, Measurement, Problem, lots
-from plenocli.inverse.volume.volume import HeldOut, Prior, Trial, Volume, predictive_sigma
+from plenocli.inverse.volume.volume import HeldOut, Trial, Volume, predictive_sigma
 
 MOST = 10_000
 """Windows, at most."""
@@ -53,6 +55,7 @@ class Tiles:
     seed: of which ones.
     where: the kernels' file, for messages.
     device: of their map.
+    like: (plane, row, column) before all lenslets, as volume_of takes it.
 
     Windows overlap by the lenslets that a voxel's light reaches, and fade into each other there.
     All have the same size, and so the same map.
@@ -70,8 +73,9 @@ class Tiles:
         seed: int,
         where: str | Path | None = None,
         device: Device = CPU,
+        like: np.ndarray | None = None,
     ) -> None:
-        self.device = device
+        self.device, self.like = device, like
         self.stack, self.measurement, self.method = stack, measurement, method
         self._hold_out, self._seed, self._where = hold_out, seed, where
         count = measurement.signal.shape[:2]
@@ -155,13 +159,23 @@ class Tiles:
         Raises as volume_of.
         """
         if len(self.windows) == 1:
-            return volume_of(self.problem(self.windows[0]), self.method)
-        first = volume_of(self.problem(self.brightest), self.method)
+            return volume_of(self.problem(self.windows[0]), self.method, self.like)
+        first = volume_of(self.problem(self.brightest), self.method, self._like(self.brightest))
         found = [
-            first if w is self.brightest else volume_like(self.problem(w), first)
+            first if w is self.brightest else volume_of_part(self.problem(w), first, self._like(w))
             for w in bar(self.windows, len(self.windows), "windows")
         ]
         return self._joined(found)
+
+    def _like(self, window: Window) -> np.ndarray | None:
+        """What the volume of a window is to be like."""
+        return None if self.like is None else self.like[(slice(None), *self._voxels(window))]
+
+    def _voxels(self, window: Window) -> tuple[slice, slice]:
+        """Rows and columns of a window's voxels."""
+        s, t = self.stack.point_shape
+        rows, columns = window.rows, window.columns
+        return slice(rows.start * s, rows.stop * s), slice(columns.start * t, columns.stop * t)
 
     def _joined(self, parts: Sequence[Volume]) -> Volume:
         rows, columns = self.measurement.signal.shape[:2]
@@ -172,10 +186,7 @@ class Tiles:
         sigma = None if parts[0].sigma is None else np.zeros_like(value)
         owner, most = np.zeros((rows, columns), int), np.zeros((rows, columns))
         for number, (window, part) in enumerate(zip(self.windows, parts)):
-            voxels = (
-                slice(window.rows.start * s, window.rows.stop * s),
-                slice(window.columns.start * t, window.columns.stop * t),
-            )
+            voxels = self._voxels(window)
             weight = np.kron(window.weight, np.ones((s, t))).astype(value.dtype)
             weights[voxels] += weight
             value[(slice(None), *voxels)] += weight * part.value
@@ -188,7 +199,6 @@ class Tiles:
         value /= weights
         if sigma is not None:
             sigma /= weights
-        priors = [part.prior for part in parts if part.prior is not None]
         return replace(
             parts[0],
             value=value,
@@ -198,8 +208,9 @@ class Tiles:
                 for number, part in enumerate(parts, 1)
             ),
             background=float(np.mean([part.background for part in parts])),
-            prior=_mean_prior(priors) if priors else None,
+            prior=_mean_of([part.prior for part in parts if part.prior is not None]),
             held_out=self._held(parts, owner),
+            likeness=_mean_of([part.likeness for part in parts if part.likeness is not None]),
         )
 
     def _held(self, parts: Sequence[Volume], owner: np.ndarray) -> HeldOut | None:
@@ -222,10 +233,12 @@ class Tiles:
         )
 
 
-def _mean_prior(priors: Sequence[Prior]) -> Prior:
-    return Prior(
-        **{name: float(np.mean([vars(p)[name] for p in priors])) for name in vars(priors[0])}
-    )
+def _mean_of(parts: Sequence[Any]) -> Any:
+    """What has numbers for fields, with their means; None of nothing."""
+    if not parts:
+        return None
+    names = vars(parts[0])
+    return type(parts[0])(**{n: float(np.mean([vars(p)[n] for p in parts])) for n in names})
 
 
 def _halo(stack: Stack) -> int:
@@ -277,6 +290,6 @@ def _needed(method: str, pixels: int, unknowns: int, torus: tuple[int, int]) -> 
     whole = BlockCirculant.needed(pixels, unknowns, torus)
     arrays = 48 * torus[0] * torus[1] * (pixels + unknowns)
     gain = 8 * frequencies * pixels * unknowns + 128 * unknowns * (unknowns + pixels)
-    steps = 8 * frequencies * unknowns**2
-    beside = {"rl": 0, "lmmse": gain, "tikhonov": gain, "tv": steps, "auto": max(gain, steps)}
-    return whole + arrays + beside[method]
+    most = {"rl": arrays, "lmmse": arrays + gain, "tikhonov": arrays + gain}
+    most["tv"] = total_variation.memory(torus, pixels, unknowns)
+    return whole + (max(most.values()) if method == "auto" else most[method])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import prod
 
@@ -12,7 +13,7 @@ from plenocli.base.progress import bar
 from plenocli.inverse.volume.lattice import Lattice, back_through_prior, lattice_of, through_prior
 from plenocli.inverse.volume.lmmse import class_variance
 from plenocli.inverse.volume.measurement import Problem
-from plenocli.inverse.volume.volume import Trial, Volume
+from plenocli.inverse.volume.volume import Likeness, Trial, Volume
 
 PENALTY, SIGN = 3e-2, 0.5
 """Of differences and of the sign, over the data's, where A' A has a mean diagonal of 1."""
@@ -26,12 +27,17 @@ LOOKED_AT = 12
 """Rounds after which it is looked again at where surfaces are."""
 BLUR, ABOUT = 1.0, 1.5
 """Pitches of voxels over which a volume is smoothed, and about a voxel, to see surfaces."""
+LITTLE = 1e-2
+"""Share of a volume's variation below which another one explains none of it."""
 GAIN = 0.01
 """Share by which weaker total variation must make the held-out error smaller to be preferred."""
 
 
 def total_variation(
-    problem: Problem, strengths: tuple[float, ...] = STRENGTHS, rounds: int = LAST
+    problem: Problem,
+    strengths: tuple[float, ...] = STRENGTHS,
+    rounds: int = LAST,
+    like: np.ndarray | None = None,
 ) -> Volume:
     """min over x >= 0 of |A x - y|^2 / 2 + strength TV(x), pixels weighted with their noise.
 
@@ -40,6 +46,8 @@ def total_variation(
         signal; the strongest that predicts held-out pixels about as well as weaker ones is taken,
         without such pixels the weakest.
     rounds: at that one, after those that chose it.
+    like: (plane, row, column) a volume of the same voxels, of another colour: as many rounds more
+        with TV(x - f like), least over f >= 0 as well, where that is LITTLE less than TV(x).
 
     Returns a volume without sigma.
     Raises NumericsError where memory is lacking.
@@ -49,7 +57,9 @@ def total_variation(
     `Surfaces` sees in the volume so far, count the less the more it is one. By the alternating
     direction method of multipliers on w = A x, v = D x and u = x >= 0: all maps are invariant
     under shifts by lenslets, so that the step in x is exact, by one matrix a lattice frequency.
-    Boyd et al. 2011; Afonso, Bioucas-Dias and Figueiredo 2011.
+    Boyd et al. 2011; Afonso, Bioucas-Dias and Figueiredo 2011. The strength belongs to differences
+    as long as they are on the mean: of what is left of a volume that is like another they are
+    shorter, and it is stronger by as much.
     """
     descent = _Descent(problem)
     state, trace, least, chosen = descent.start(), [], np.inf, strengths[0]
@@ -60,10 +70,16 @@ def total_variation(
         if misfit > (1 - GAIN) * least:
             break
         state, least, chosen = tried, misfit, strength
-    for done in range(0, rounds, LOOKED_AT):
-        seen = descent.surfaces(state)
-        state = descent.rounds(state, chosen, min(LOOKED_AT, rounds - done), seen)
+    state = descent.last(state, chosen, rounds)
     trace.append(Trial(f"strength {chosen:g}, to the end", problem.misfit(state.light)))
+    likeness = None if like is None else descent.tie_to(like, state)
+    if like is not None and likeness is not None and likeness.factor:
+        stronger = chosen / max(1 - likeness.share, LITTLE)
+        for _ in range(0, rounds, LOOKED_AT):
+            state = descent.last(state, stronger, min(LOOKED_AT, rounds))
+            likeness = descent.tie_to(like, state)
+        told = f"of what is not {likeness.factor:.3g} of the other volume"
+        trace.append(Trial(told, problem.misfit(state.light)))
     return Volume(
         value=problem.inside(problem.voxels.lenslets(state.u)),
         sigma=None,
@@ -73,7 +89,17 @@ def total_variation(
         prior=None,
         held_out=problem.judged(state.light),
         margin=problem.margin,
+        likeness=likeness,
     )
+
+
+def memory(torus: tuple[int, int], pixels: int, unknowns: int, itemsize: int = 4) -> int:
+    """Bytes of the steps, and of the arrays that rounds and surfaces take, as measured.
+
+    torus: (rows, columns) of lenslets; pixels, unknowns: of one; itemsize: of a number.
+    """
+    steps = 2 * torus[0] * (torus[1] // 2 + 1) * unknowns**2
+    return itemsize * (steps + prod(torus) * (62 * unknowns + 19 * pixels))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,8 +121,8 @@ class _Descent:
     def __init__(self, problem: Problem) -> None:
         op = problem.op
         self.problem, self.whole = problem, op.on_torus()
-        frequencies, pixels, unknowns = op.spectrum.shape
-        needed = op.spectrum.itemsize * frequencies * unknowns**2 + 48 * prod(op.domain.shape)
+        _, pixels, unknowns = op.spectrum.shape
+        needed = memory(op.torus, pixels, unknowns, op.dtype.itemsize)
         budget().require(needed, "total variation", fewer="take fewer planes")
         variance = class_variance(problem)
         noise = float(np.mean(variance[np.isfinite(variance)]))
@@ -117,6 +143,7 @@ class _Descent:
         self.counts[:rows, :columns] = problem.counts
         seen = problem.signal[problem.counts].astype(float)
         self.unit = float(np.sqrt(np.mean(seen**2))) / scale
+        self.other: _Other | None = None
 
     def start(self) -> _State:
         """An empty volume."""
@@ -134,9 +161,25 @@ class _Descent:
             light=np.zeros(self.problem.signal.shape, self.whole.dtype),
         )
 
-    def surfaces(self, state: _State) -> Surfaces:
-        """Those of the volume so far."""
-        return surfaces_of(state.u, self.along, self.down)
+    def tie_to(self, like: np.ndarray, state: _State) -> Likeness:
+        """From here on what varies is the volume less that factor times `like`, (plane, row,
+        column) before the lenslets, which makes its variation least.
+        """
+        _, rows, columns = like.shape
+        inside = state.u[:, :rows, :columns]
+        factor, share = least_variation(inside, like, self.along, self.down)
+        self.other = None
+        if factor:
+            self.other = _other_of(factor * like, state.u.shape, self.along, self.down)
+        return Likeness(factor=factor, share=share)
+
+    def last(self, state: _State, strength: float, rounds: int) -> _State:
+        """Rounds in which surfaces are free to be steep."""
+        for done in range(0, rounds, LOOKED_AT):
+            left = state.u if self.other is None else state.u - self.other.picture
+            seen = surfaces_of(left, self.along, self.down)
+            state = self.rounds(state, strength, min(LOOKED_AT, rounds - done), seen)
+        return state
 
     def rounds(
         self, state: _State, strength: float, count: int, surfaces: Surfaces | None = None
@@ -164,7 +207,13 @@ class _Descent:
         w = (self.counts * self.y + aim) / (self.counts + 1)
         steps = zip(differences(x, self.along, self.down), state.v, state.of_v)
         aims = tuple(_beyond(g, v) + d for g, v, d in steps)
+        others = () if self.other is None else self.other.steps
+        for a, other in zip(aims, others):
+            a -= other
         v = shrunk(aims, strength / kind(PENALTY), surfaces)
+        of_v = tuple(a - b for a, b in zip(aims, v))
+        for b, other in zip(v, others):
+            b += other
         above = _beyond(x, state.u) + state.of_u
         u = np.maximum(above, 0)
         return _State(
@@ -172,10 +221,56 @@ class _Descent:
             v=v,
             u=u,
             of_w=aim - w,
-            of_v=tuple(a - b for a, b in zip(aims, v)),
+            of_v=of_v,
             of_u=above - u,
             light=state.light,
         )
+
+
+@dataclass(frozen=True)
+class _Other:
+    """What a volume is like, on the torus.
+
+    picture: (plane, row, column), beyond the lenslets as at their edge.
+    steps: its differences, none from or to what is beyond.
+    """
+
+    picture: np.ndarray
+    steps: tuple[np.ndarray, ...]
+
+
+def _other_of(like: np.ndarray, shape: Sequence[int], along: np.ndarray, down: float) -> _Other:
+    """`like`, (plane, row, column) before the lenslets, on a torus of `shape`."""
+    _, rows, columns = like.shape
+    beyond = (0, 0), (0, shape[1] - rows), (0, shape[2] - columns)
+    steps = differences(like, along, down)
+    steps[1][:, -1], steps[2][..., -1] = 0, 0  # from one side to the other
+    return _Other(np.pad(like, beyond, mode="edge"), tuple(np.pad(d, beyond) for d in steps))
+
+
+def least_variation(
+    x: np.ndarray, like: np.ndarray, along: np.ndarray, down: float
+) -> tuple[float, float]:
+    """(f, share): the f >= 0 for which x - f like varies least, and the share of the variation of x
+    that is gone then; (0, 0) where that is less than LITTLE.
+
+    x, like: (plane, row, column); along, down: as in `differences`.
+    """
+    from scipy.optimize import minimize_scalar
+
+    own, other = (_other_of(v.astype(float), v.shape, along, down).steps for v in (x, like))
+    alone, of_other = (float(np.sqrt(_squares(v)).sum()) for v in (own, other))
+    if not alone or not of_other:
+        return 0.0, 0.0
+    most = 2 * alone / of_other  # convex, and beyond it more than at 0
+
+    def variation(part: float) -> float:
+        rest = tuple(a - part * most * b for a, b in zip(own, other))
+        return float(np.sqrt(_squares(rest)).sum())
+
+    found = minimize_scalar(variation, bounds=(0, 1), method="bounded")
+    share = 1 - float(found.fun) / alone
+    return (float(found.x) * most, share) if share > LITTLE else (0.0, 0.0)
 
 
 def differences(x: np.ndarray, along: np.ndarray, down: float = 1.0) -> tuple[np.ndarray, ...]:
@@ -224,14 +319,17 @@ def surfaces_of(x: np.ndarray, along: np.ndarray, down: float) -> Surfaces:
     deep = np.gradient(smooth, axis=0) if len(x) > 1 else np.zeros_like(x)
     across = (np.roll(smooth, -1, axis) - np.roll(smooth, 1, axis) for axis in (1, 2))
     gradient = [depth * deep, *(w / 2 * part for w, part in zip(wide[1:], across))]
-    tensor = np.empty((*x.shape, 3, 3), x.dtype)
-    for i, j in zip(*np.triu_indices(3)):
-        mean = gaussian_filter(gradient[i] * gradient[j], ABOUT * wide, mode=edges)
-        tensor[..., i, j] = tensor[..., j, i] = mean
-    values, vectors = np.linalg.eigh(tensor)
-    least = np.finfo(x.dtype).tiny
-    free = np.maximum(1 - 2 * np.maximum(values[..., 1], 0) / np.maximum(values[..., 2], least), 0)
-    normal = np.ascontiguousarray(np.moveaxis(vectors[..., 2], -1, 0))
+    pairs = list(zip(*np.triu_indices(3)))
+    means = [gaussian_filter(gradient[i] * gradient[j], ABOUT * wide, mode=edges) for i, j in pairs]
+    normal, free = np.empty((3, *x.shape), x.dtype), np.empty_like(x)
+    tensor, least = np.empty((*x.shape[1:], 3, 3), x.dtype), np.finfo(x.dtype).tiny
+    for plane in range(len(x)):
+        for (i, j), mean in zip(pairs, means):
+            tensor[..., i, j] = tensor[..., j, i] = mean[plane]
+        values, vectors = np.linalg.eigh(tensor)
+        ratio = np.maximum(values[..., 1], 0) / np.maximum(values[..., 2], least)
+        free[plane] = np.maximum(1 - 2 * ratio, 0)
+        normal[:, plane] = np.moveaxis(vectors[..., 2], -1, 0)
     return Surfaces((normal[0], normal[1], normal[2]), free)
 
 
@@ -245,8 +343,7 @@ def shrunk(
     differences again (the proximal average; Bauschke, Goebel, Lucet and Wang 2008).
     """
     deep, down, right = v
-    square = down**2 + right**2
-    square[:-1] += deep**2
+    square = _squares(v)
     left = _left(np.sqrt(square), by)
     if surfaces is None:
         return deep * left[:-1], down * left, right * left
@@ -260,9 +357,17 @@ def shrunk(
     return deep + (normal[0] * more)[:-1], down + normal[1] * more, right + normal[2] * more
 
 
+def _squares(v: tuple[np.ndarray, ...]) -> np.ndarray:
+    """Of the differences' length at every voxel."""
+    deep, down, right = v
+    square = down**2 + right**2
+    square[:-1] += deep**2
+    return square
+
+
 def _left(length: np.ndarray, by: np.ndarray | np.floating) -> np.ndarray:
     """Share of a length that is left after it is shorter by `by`."""
-    return np.maximum(1 - by / np.maximum(length, np.finfo(np.float32).tiny), 0)
+    return 1 - by / np.maximum(length, np.maximum(by, np.finfo(np.float32).tiny))
 
 
 def _beyond(new: np.ndarray, old: np.ndarray) -> np.ndarray:

@@ -111,6 +111,18 @@ class Prior:
 
 
 @dataclass(frozen=True)
+class Likeness:
+    """How a volume goes with one of another colour.
+
+    factor: times the other one, which is taken off before variation is counted; 0: not at all.
+    share: of the total variation, that is gone then.
+    """
+
+    factor: float
+    share: float
+
+
+@dataclass(frozen=True)
 class Trial:
     """One thing that was tried: which, and the mean square error of held-out pixels over their
     variance.
@@ -132,6 +144,7 @@ class Volume:
     prior: that was assumed; None where none was.
     held_out: pixels that were put aside, predicted; None where none were.
     margin: lenslets from the border on which light of some voxels was not seen.
+    likeness: to the volume that it was to be like; None where none was named.
     """
 
     value: np.ndarray
@@ -142,3 +155,4 @@ class Volume:
     prior: Prior | None
     held_out: HeldOut | None
     margin: int
+    likeness: Likeness | None = None

@@ -6,18 +6,24 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from plenocli.base.errors import UsageError
 from plenocli.base.progress import note
 from plenocli.base.text import Record, by
 from plenocli.base.units import format_length
 
 if TYPE_CHECKING:
     from plenocli.files.artefacts.provenance import Provenance
+    from plenocli.files.results.volumes import StoredVolume
     from plenocli.forward.volume.stack import Stack
     from plenocli.inverse.volume.tiles import Tiles
     from plenocli.inverse.volume.volume import Trial, Volume
 
 WORTH_SAYING = 5e-3
 """Share of the light from which on haze is told."""
+CLEARER_DB = 3.0
+"""By which held-out pixels are predicted better than those of the volume that this one is tied to,
+from which on that is told.
+"""
 SUFFIXES = (".h5", ".tif", ".tiff")
 
 
@@ -31,6 +37,8 @@ class VolumeSummary(Record):
     explained_db: of the variance of held-out pixels; None where none were held out.
     held_by_bars: share of them within 95 % bars, by quartile of brightness, darkest first.
     margin: lenslets from the border on which light is missing.
+    like_factor: times the volume of --like, what is tied to it; 0 where nothing is.
+    like_share: of the total variation, that this explains; both None without --like.
     """
 
     output: str
@@ -41,6 +49,8 @@ class VolumeSummary(Record):
     explained_db: float | None
     held_by_bars: list[float] | None
     margin: int
+    like_factor: float | None
+    like_share: float | None
 
     def line(self) -> str:
         """One sentence for people."""
@@ -51,6 +61,13 @@ class VolumeSummary(Record):
                 f"; held-out pixels are predicted to {self.explained_db:.1f} dB of their variance, "
                 f"95 % bars hold {min(self.held_by_bars):.0%} to {max(self.held_by_bars):.0%} of "
                 "them by brightness"
+            )
+        if self.like_factor is not None and self.like_share is not None:
+            text += (
+                f"; {self.like_factor:.3g} of the other volume is {self.like_share:.0%} of what "
+                "varies"
+                if self.like_factor
+                else "; it has no structure of the other volume, and is not tied to it"
             )
         return f"{text}; {self.margin} lenslets along the border miss light"
 
@@ -66,6 +83,7 @@ def run_volume(
     background: float | Literal["auto"] = "auto",
     most_planes: int | None = None,
     channel: str | None = None,
+    like: Path | str | None = None,
     device: str = "cpu",
     overwrite: bool = False,
     seed: int = 0,
@@ -83,6 +101,8 @@ def run_volume(
         lenslets, where that predicts the held-out pixels better.
     most_planes: keep the planes that predict held-out pixels best, no more than this; None: all.
     channel: letter of a colour sensor's pixels that are taken, each at its own place.
+    like: volume (.h5) of another colour of the same specimen, on the same voxels and clearer, whose
+        structure this one may share; for total variation, then the method of "auto".
     device: "cpu" or "cuda", where the kernels' map multiplies and transforms.
 
     Raises UsageError, InputError, NumericsError where memory does not suffice, OutputError.
@@ -93,12 +113,16 @@ def run_volume(
     from plenocli.files.images.mosaic import read_capture
     from plenocli.files.read.calibrations import read_calibration
     from plenocli.files.results.stacks import read_stack
+    from plenocli.files.results.volumes import read_volume, same_voxels
     from plenocli.inverse.volume.superpixels import measured
     from plenocli.inverse.volume.tiles import Tiles
-    from plenocli.inverse.volume.volume import all_known
 
     output = Path(output)
-    check_output(output, overwrite=overwrite, inputs=[capture, pif, calibration], suffixes=SUFFIXES)
+    inputs = {"capture": capture, "pif": pif, "calibration": calibration, "like": like}
+    check_output(output, overwrite=overwrite, inputs=list(inputs.values()), suffixes=SUFFIXES)
+    if like is not None and method not in ("auto", "tv"):
+        raise UsageError("volumes are tied by total variation alone", "--method", "leave it out")
+    other = None if like is None else read_volume(like)
     there = device_of(device)
     stack = read_stack(pif)
     known = None if calibration is None else read_calibration(calibration, response=False)
@@ -118,10 +142,13 @@ def run_volume(
     )
     trials: tuple[Trial, ...] = ()
     how: dict[str, Any] = dict(hold_out=hold_out, seed=seed, where=pif, device=there)
+    method = method if like is None else "tv"
     tiles = Tiles(stack, measurement, method, **how)
     if most_planes is not None:
         stack, trials = _supported(tiles, most_planes)
         tiles = Tiles(stack, measurement, method, **how)
+    if like is not None and other is not None:
+        tiles.like = same_voxels(other, stack, (rows, columns), like)
     if len(tiles.windows) > 1:
         size = by(tiles.windows[0].weight.shape)
         note(f"in {len(tiles.windows)} windows of {size} lenslets: --mem-limit allows no more")
@@ -129,12 +156,23 @@ def run_volume(
         _take_haze(tiles)
     volume = tiles.volume()
     volume = replace(volume, trace=(*trials, *volume.trace))
-    inputs = describe_inputs({"capture": capture, "pif": pif, "calibration": calibration})
     provenance = Provenance(
-        command=command, inputs=inputs, seed=seed, accuracy=stack.accuracy.as_json()
+        command=command,
+        inputs=describe_inputs(inputs),
+        seed=seed,
+        accuracy=stack.accuracy.as_json(),
     )
     _write(output, volume, stack, provenance, overwrite, there.name)
-    held = volume.held_out
+    summary = _summary(output, volume, stack)
+    if like is not None and other is not None and summary.explained_db is not None:
+        _tell_of_the_clearer(summary.explained_db, other, like)
+    return summary
+
+
+def _summary(output: Path, volume: Volume, stack: Stack) -> VolumeSummary:
+    from plenocli.inverse.volume.volume import all_known
+
+    held, likeness = volume.held_out, volume.likeness
     explained = None if held is None else all_known([held.explained_db])
     return VolumeSummary(
         output=str(output),
@@ -145,7 +183,19 @@ def run_volume(
         explained_db=None if explained is None else explained[0],
         held_by_bars=None if held is None else all_known(held.held_by_bars),
         margin=volume.margin,
+        like_factor=None if likeness is None else likeness.factor,
+        like_share=None if likeness is None else likeness.share,
     )
+
+
+def _tell_of_the_clearer(explained_db: float, other: StoredVolume, path: Path | str) -> None:
+    """Say so where the other volume, by its held-out pixels, is the less clear one."""
+    others_db = other.facts.get("held_out.explained_db")
+    if others_db is not None and others_db < explained_db - CLEARER_DB:
+        note(
+            f"{path}: held-out pixels are predicted to {others_db:.1f} dB there and to "
+            f"{explained_db:.1f} dB here: tie that volume to this one, not this one to it"
+        )
 
 
 def _supported(tiles: Tiles, most: int) -> tuple[Stack, tuple[Trial, ...]]:

@@ -1,5 +1,7 @@
 """Windows of lenslets give what all lenslets at once give, and are as few as memory wants."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -47,9 +49,9 @@ def measurement(stack):
     return Measurement(signal=light + 0.01 * rng.standard_normal(light.shape), read_variance=1e-4)
 
 
-def tiled(stack, measurement, method, memory=1 << 40):
+def tiled(stack, measurement, method, memory=1 << 40, like=None):
     with within(Budget(memory)):
-        found = Tiles(stack, measurement, method, hold_out=0.1, seed=1)
+        found = Tiles(stack, measurement, method, hold_out=0.1, seed=1, like=like)
         return found, found.volume()
 
 
@@ -80,6 +82,28 @@ def test_windows_give_what_all_lenslets_at_once_give(stack, measurement, method)
     if expected.sigma is not None:
         assert np.allclose(found.sigma, expected.sigma, rtol=0.15)
     assert len(found.trace) == len(parts.windows)
+
+
+def test_windows_are_tied_to_their_part_of_another_volume(stack, measurement):
+    """To a volume of the same specimen, moved by nothing; and, to see that it matters, moved."""
+    clear = tiled(stack, measurement, "tv")[1].value
+    rng = np.random.default_rng(8)
+    noisy = replace(
+        measurement,
+        signal=measurement.signal + 0.1 * rng.standard_normal(measurement.signal.shape),
+        read_variance=1e-2,
+    )
+    errors = {}
+    for name, like in {"alone": None, "own": clear, "moved": np.roll(clear, 10, axis=2)}.items():
+        for memory in (1 << 40, memory_of("tv", MANY)):
+            parts, found = tiled(stack, noisy, "tv", memory, like)
+            errors[name, len(parts.windows)] = np.linalg.norm(found.value - clear)
+            assert (found.likeness is None) == (like is None)
+            assert like is None or (found.likeness.share > 0.1) == (name == "own")
+    one, several = ({n: v for (n, w), v in errors.items() if (w == 1) == s} for s in (True, False))
+    assert len(one) == len(several) == 3
+    for found in (one, several):
+        assert found["own"] < 0.8 * found["alone"] < 0.85 * found["moved"]
 
 
 def test_a_pixel_is_put_aside_in_every_window_that_has_it(stack, measurement):

@@ -1,5 +1,7 @@
 """Least total variation against a primal-dual solver of the same problem in dense matrices."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
@@ -11,6 +13,8 @@ from plenocli.inverse.volume.total_variation import (
     Surfaces,
     back_differences,
     differences,
+    least_variation,
+    memory,
     shrunk,
     surfaces_of,
     total_variation,
@@ -67,13 +71,15 @@ def isotropic(monkeypatch):
     monkeypatch.setattr("plenocli.inverse.volume.total_variation.surfaces_of", nowhere)
 
 
-def cost(x, a, y, weight, steps):
-    return 0.5 * np.sum((a @ x - y) ** 2) + weight * lengths([d @ x for d in steps]).sum()
+def cost(x, a, y, weight, steps, others=(0, 0, 0)):
+    varies = [d @ x - o for d, o in zip(steps, others)]
+    return 0.5 * np.sum((a @ x - y) ** 2) + weight * lengths(varies).sum()
 
 
-def primal_dual(a, y, weight, steps, rounds=5000):
-    """Chambolle and Pock 2011."""
+def primal_dual(a, y, weight, steps, others=None, rounds=5000):
+    """Chambolle and Pock 2011; others: differences that count for none."""
     d = np.concatenate(steps)
+    shift = np.zeros(len(d)) if others is None else np.concatenate(others)
     norm = np.linalg.norm(np.concatenate([a, d]), 2)
     tau = sigma = 0.99 / norm
     x = ahead = np.zeros(a.shape[1])
@@ -81,7 +87,7 @@ def primal_dual(a, y, weight, steps, rounds=5000):
     splits = np.cumsum([len(s) for s in steps])[:-1]
     for _ in range(rounds):
         p = (p + sigma * (a @ ahead - y)) / (1 + sigma)
-        q = q + sigma * (d @ ahead)
+        q = q + sigma * (d @ ahead - shift)
         parts = np.split(q, splits)
         long = np.maximum(lengths(parts) / weight, 1)
         q = np.concatenate([parts[0] / long[: len(parts[0])], parts[1] / long, parts[2] / long])
@@ -102,6 +108,74 @@ def test_it_is_the_least(strength, monkeypatch):
     assert cost(1.02 * expected, *terms) > least < cost(0.98 * expected, *terms)
     np.testing.assert_allclose(volume.value, inner, atol=5e-3 * inner.max())
     assert np.all(volume.value >= 0) and volume.method == "tv"
+
+
+def differences_of(picture, inside):
+    """Between voxels that are both among the first rows and columns `inside`, one by one, in the
+    order of `gradients`; 0 elsewhere.
+    """
+    planes, rows, columns = picture.shape
+    found = [np.zeros((planes - 1, rows, columns)), *np.zeros((2, *picture.shape))]
+    for plane, row, column in np.ndindex(planes, *inside):
+        here = picture[plane, row, column]
+        if plane + 1 < planes:
+            found[0][plane, row, column] = ALONG[plane] * (picture[plane + 1, row, column] - here)
+        if row + 1 < inside[0]:
+            found[1][plane, row, column] = picture[plane, row + 1, column] - here
+        if column + 1 < inside[1]:
+            found[2][plane, row, column] = picture[plane, row, column + 1] - here
+    return [part.ravel() for part in found]
+
+
+def test_it_is_the_least_beside_another_volume(monkeypatch):
+    """What is not f times the other varies least, over f as well, at a strength as much higher as
+    what was found without it varied less; the other is known before the lenslets alone.
+    """
+    isotropic(monkeypatch)
+    problem, truth = box()
+    like = truth[:, :6, :8] + 0.02 * np.random.default_rng(6).random((2, 6, 8))
+    alone = total_variation(problem, (0.1,), 600)
+    share = least_variation(alone.value, like, ALONG, 1.0)[1]
+    assert 0.2 < share < 0.95
+    volume = total_variation(problem, (0.1,), 600, like=like)
+    factor = volume.likeness.factor
+    terms = (*dense_terms(problem, 0.1 / (1 - share)), gradients())
+    others = differences_of(np.pad(like, ((0, 0), (0, 2), (0, 2))), (6, 8))
+    expected = primal_dual(*terms, [factor * o for o in others])
+    inner = problem.inside(expected.reshape(problem.op.domain.shape))
+    np.testing.assert_allclose(volume.value, inner, atol=5e-3 * inner.max())
+
+    def least(f):
+        f_others = [f * o for o in others]
+        return cost(primal_dual(*terms, f_others), *terms, f_others)
+
+    assert least(1.1 * factor) > least(factor) < least(0.9 * factor)
+
+
+@pytest.mark.parametrize("scale", [1e-20, 1.0, 1e20])
+def test_the_factor_is_that_of_the_least_variation(scale):
+    """Against all factors in turn, whatever the other's unit."""
+    rng = np.random.default_rng(7)
+    other = rng.random((3, 8, 9)) > 0.7
+    x = 0.8 * other + 0.3 * (rng.random((3, 8, 9)) > 0.8)
+    along = np.array([0.5, 1.0])
+
+    def variation(f):
+        deep, down, right = (np.diff(x - f * other, axis=axis) for axis in range(3))
+        square = np.zeros(x.shape)
+        square[:-1] += (along[:, None, None] * deep) ** 2
+        square[:, :-1] += down**2
+        square[:, :, :-1] += right**2
+        return np.sqrt(square).sum()
+
+    tried = np.linspace(0, 2, 4001)
+    all_of_them = [variation(f) for f in tried]
+    factor, share = least_variation(x, scale * other, along, 1.0)
+    assert scale * factor == pytest.approx(tried[np.argmin(all_of_them)], abs=2e-3)
+    assert share == pytest.approx(1 - min(all_of_them) / variation(0), abs=1e-4)
+    for nothing in (np.zeros_like(x), np.ones_like(x)):
+        assert least_variation(x, nothing, along, 1.0) == (0, 0)
+        assert least_variation(nothing, x, along, 1.0) == (0, 0)
 
 
 def test_differences_and_their_adjoint():
@@ -188,6 +262,25 @@ def test_the_strength_is_chosen_by_held_out_pixels(dtype):
     assert volume.value.dtype == dtype
     error = volume.value - truth[:, :12, :12]
     assert np.linalg.norm(error) < 0.3 * np.linalg.norm(truth)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("tied", [False, True])
+def test_it_takes_the_memory_that_it_asks_for(dtype, tied):
+    rng = np.random.default_rng(9)
+    planes, count, torus = 6, (24, 24), (26, 26)
+    kernels = rng.random((1, 40, 4 * planes)).astype(dtype)
+    op = BlockCirculant([(kernels, np.zeros((1, 2), int))], count, torus)
+    voxels = Voxels((2, 2), 1e-6, tuple(1e-6 * np.arange(planes)))
+    measurement = Measurement(signal=rng.random((*count, 40)).astype(dtype), read_variance=1e-2)
+    problem = Problem(op, measurement, voxels)
+    like = total_variation(problem).value  # what is imported is not counted
+    tracemalloc.start()
+    total_variation(problem, like=like if tied else None)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    asked = memory(torus, 40, 4 * planes, np.dtype(dtype).itemsize)
+    assert 0.7 * asked < peak < 1.1 * asked
 
 
 def test_memory_is_asked_for():

@@ -17,7 +17,7 @@ import os
 import signal
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import (
     FIRST_COMPLETED,
     BrokenExecutor,
@@ -84,7 +84,7 @@ def open_pool(
     else:
         with (
             _one_thread(),
-            _environment(),
+            _environment(_THREADS),
             contextlib.closing(
                 _Executing(lambda: _processes(workers), lambda: 2 * workers)
             ) as pool,
@@ -117,11 +117,10 @@ def run_all(pool: Pool, jobs: Iterable[Job]) -> Iterator[tuple[Any, Any]]:
 
 @contextlib.contextmanager
 def _one_thread() -> Iterator[None]:
-    # a library of its own, which the limit below reaches only once it is loaded
-    import scipy.linalg.blas  # noqa: F401
     from threadpoolctl import threadpool_limits
 
-    with threadpool_limits(1, "blas"):
+    # SciPy has a library of its own, which the limit does not reach where it is loaded later
+    with threadpool_limits(1, "blas"), _environment(_THREADS[1:]):
         yield
 
 
@@ -369,12 +368,12 @@ def _become_worker() -> None:
 
 
 @contextlib.contextmanager
-def _environment() -> Iterator[None]:
-    """One thread of linear algebra for processes started meanwhile: it is read when their
-    libraries are loaded.
+def _environment(names: Sequence[str]) -> Iterator[None]:
+    """One thread of linear algebra for libraries, and processes, that are loaded meanwhile: these
+    variables are read then.
     """
-    before = {name: os.environ.get(name) for name in _THREADS}
-    os.environ.update(dict.fromkeys(_THREADS, "1"))
+    before = {name: os.environ.get(name) for name in names}
+    os.environ.update(dict.fromkeys(names, "1"))
     try:
         yield
     finally:

@@ -110,6 +110,24 @@ def test_linear_algebra_has_one_thread_everywhere(tasks, monkeypatch):
     assert os.environ["OMP_NUM_THREADS"] == "2"
 
 
+def test_a_library_that_is_loaded_by_a_task_has_one_thread():
+    code = (
+        "import numpy\n"
+        "from threadpoolctl import threadpool_info\n"
+        "from plenocli.execution.pool import open_pool\n"
+        "import sys; assert 'scipy' not in sys.modules\n"
+        "with open_pool():\n"
+        "    import scipy.linalg\n"
+        "    found = [i['num_threads'] for i in threadpool_info() if i['user_api'] == 'blas']\n"
+        "print(len(found) > 1, max(found))"
+    )
+    threads = {"OMP_NUM_THREADS": "2", "OPENBLAS_NUM_THREADS": "2"}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=os.environ | threads, capture_output=True, text=True
+    )
+    assert done.stdout.split() == ["True", "1"], done.stderr
+
+
 def test_a_process_that_dies_takes_no_result_along(tasks, tmp_path):
     with open_pool(2) as pool:
         jobs = [(n, tasks.square, n) for n in range(4)]

@@ -13,8 +13,8 @@ import os
 import struct
 from collections.abc import Iterable, Mapping, Sequence
 from fractions import Fraction
+from html import escape, unescape
 from typing import Any
-from xml.sax.saxutils import escape, unescape
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -242,7 +242,8 @@ def _packet(notes: dict[str, Any]) -> bytes:
         '<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?><x:xmpmeta '
         'xmlns:x="adobe:ns:meta/"><rdf:RDF '
         'xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#"><rdf:Description rdf:about="" '
-        f'xmlns:plenocli="https://plenocli.invalid/ns/1/">{_OPEN}{escape(text)}{_CLOSE}</'
+        f'xmlns:plenocli="https://plenocli.invalid/ns/1/">{_OPEN}'
+        f"{escape(text, quote=False)}{_CLOSE}</"
         'rdf:Description></rdf:RDF></x:xmpmeta><?xpacket end="r"?>'
     )
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from plenocli.base.errors import ConfigError
+from plenocli.forward.sensor.frames import shifted_neighbours
 
 if TYPE_CHECKING:
     from plenocli.forward.camera.model import Camera
@@ -158,7 +159,7 @@ def doubted_array(white: np.ndarray, cfa: str) -> str | None:
     image = white[first[0] :, first[1] :][:LOOKED_AT, :LOOKED_AT]
     image = np.where(image > 0, image, np.nan)
     inside = image[2:-2, 2:-2]
-    two_off = image[:-4, 2:-2], image[4:, 2:-2], image[2:-2, :-4], image[2:-2, 4:]
+    two_off = [moved[2:-2, 2:-2] for moved in shifted_neighbours(image, 2)]
     diagonal = (image[1:-3, 1:-3] + image[1:-3, 3:-1] + image[3:-1, 1:-3] + image[3:-1, 3:-1]) / 4
     flat = np.abs(sum(two_off) / (4 * inside) - 1) < FLAT
     flat &= np.all([np.abs(pixel / inside - 1) < STEEP for pixel in two_off], axis=0)

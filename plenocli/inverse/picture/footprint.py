@@ -34,6 +34,7 @@ class Sizes:
     reach: of them, in lenslets.
     directions: through which the joint estimate sees a superpixel.
     atoms: of the dictionary, 0 without one.
+    precision: bytes of a number of the matrix.
     """
 
     lenslets: int
@@ -44,6 +45,7 @@ class Sizes:
     reach: int
     directions: int
     atoms: int
+    precision: int = NUMBER
 
     @classmethod
     def of(cls, system: LensletMatrix, lenslets: int, directions: int, atoms: int) -> Sizes:
@@ -58,12 +60,13 @@ class Sizes:
             reach=int(np.abs(system.offsets).max(initial=0)),
             directions=directions,
             atoms=atoms,
+            precision=system.blocks.dtype.itemsize,
         )
 
     @property
-    def blocks(self) -> int:
-        """Numbers of the matrix."""
-        return self.offsets * self.pixels * self.points
+    def blocks(self) -> float:
+        """What the matrix takes, in numbers of eight bytes."""
+        return self.offsets * self.pixels * self.points * self.precision / NUMBER
 
     @property
     def least(self) -> int:

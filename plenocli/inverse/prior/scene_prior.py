@@ -85,7 +85,15 @@ class ScenePrior:
         return _kept(
             self._own,
             (sigma, scene),
-            lambda: lmmse.prepare(self.svd(), mean, covariance, sigma, self.bands()),
+            lambda: lmmse.prepare(
+                self.svd(),
+                mean,
+                covariance,
+                sigma,
+                self.bands(),
+                matrix=[self.system.own],
+                keep=self.keep,
+            ),
         )
 
     def _measured(self, pictures: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:

@@ -93,6 +93,26 @@ def test_lmmse_is_the_textbook_formula(system, scale):
         np.testing.assert_allclose(found[:, k], mean + gain @ (y[:, k] - a @ mean), atol=5e-3)
 
 
+def test_lmmse_at_another_noise_keeps_what_both_have(system):
+    """From one power of two to the next nothing is worked out anew, and nothing differs."""
+    a, _, y = system
+    root = np.random.default_rng(1).standard_normal((36, 36)) / 6
+    c, mean, held = root @ root.T, np.linspace(0, 1, 36), {}
+
+    def keep(name, inputs, make):
+        key = name, tuple(values.tobytes() for values in inputs)
+        if key not in held:
+            held[key] = make()
+        return held[key]
+
+    svd = linear.decompose(a)
+    for sigma, kept in ((1.0e-3, 1), (1.9e-3, 1), (0.98e-3, 1), (0.97e-3, 2)):
+        found = lmmse.prepare(svd, mean, c, sigma, matrix=[a], keep=keep)
+        assert len(held) == kept and (found.power > 1e-4 * sigma**2).all()
+        alone = lmmse.prepare(svd, mean, c, sigma)
+        np.testing.assert_array_equal(found.apply(y, 1.0), alone.apply(y, 1.0))
+
+
 BANDS = np.array([[1.0, 0.5, 0.1], [0.5, 1.2, 0.3], [0.1, 0.3, 0.8]])
 
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from plenocli.inverse.picture.lenslet_model import Common, alone
+from plenocli.inverse.picture.lenslet_model import Common, Keep, alone, work_out
 from plenocli.inverse.picture.solvers.least_squares import Svd
 
 SCALES = np.geomspace(1e-3, 30, 60)
@@ -187,6 +187,9 @@ def prepare(
     covariance: np.ndarray,
     sigma: float,
     bands: np.ndarray | Sequence[Sequence[float]] = ((1.0,),),
+    *,
+    matrix: Sequence[np.ndarray] = (),
+    keep: Keep = work_out,
 ) -> Lmmse:
     """The LMMSE estimator for y = A x + n, n white, x = level + t with any level and t of the given
     statistics at an unknown scale.
@@ -195,7 +198,8 @@ def prepare(
     here, as the superpixel measures it: level(x) = F^+ A x, F = A times fields of ones. What is
     left of y, (I - F F^+) y, depends on t alone, and t = m + C A^T (A C A^T + sigma^2/scale I)^-1
     (y - A m) is worked out in the eigenvectors of the signal's covariance: of directions of A whose
-    signal is below 0.3 % of the noise, and of eigenvectors below 1 % of it, nothing is kept. Bands
+    signal is below 0.3 % of the noise (of the power of two below it), and of eigenvectors below 1 %
+    of it, nothing is kept. Bands
     that the superpixel hardly tells apart (LEVEL_SURE) have no free brightness of their own: there
     it is part of t.
 
@@ -203,6 +207,8 @@ def prepare(
     mean, covariance: (point,) and (point, point) of fields of natural photographs.
     sigma: noise of a pixel, > 0.
     bands: (band, band) covariance of the bands at a point, its diagonal about 1.
+    matrix: what `svd` depends on.
+    keep: of what does not depend on the noise, but for the power of two below it.
 
     Raises NumericsError where sigma is not positive.
     Kay, Estimation Theory, 1993, section 12.3, for one scale; docs/model.md, "Spatial
@@ -210,7 +216,43 @@ def prepare(
     """
     require_noise(sigma)
     bands = np.asarray(bands, float)
-    levels, even = _levels(svd, bands, float(np.mean(np.diag(covariance))), sigma)
+    variance = float(np.mean(np.diag(covariance)))
+    levels, even = _levels(svd, bands, variance, sigma)
+    least = 2.0 ** np.floor(np.log2(sigma))  # one for all noises up to twice it
+    shown = keep(
+        "lmmse",
+        [*matrix, mean, covariance, bands, levels, np.array(least)],
+        lambda: _shown(svd, mean, covariance, bands, levels, even, least),
+    )
+    expected, offset, analysis, power, gain, variances = shown
+    first = int(np.searchsorted(power, 1e-4 * sigma**2, side="right"))
+    power = power[first:]
+    return Lmmse(
+        levels=levels,
+        even=even,
+        mean=expected,
+        offset=offset[first:],
+        analysis=analysis[first:],
+        power=power,
+        gain=np.ascontiguousarray(gain[:, first:]),
+        variance=variances,
+        noise=np.full(len(power), float(sigma) ** 2),
+        sigma=float(sigma),
+    )
+
+
+def _shown(
+    svd: Svd,
+    mean: np.ndarray,
+    covariance: np.ndarray,
+    bands: np.ndarray,
+    levels: np.ndarray,
+    even: np.ndarray,
+    sigma: float,
+) -> tuple[np.ndarray, ...]:
+    """(mean, offset, analysis, power, gain, variance) of Lmmse, weakest first, as far as what is
+    shown stands above noise sigma.
+    """
     left = levels / np.linalg.norm(levels, axis=1)[:, None]
     weight = (levels @ svd.u * svd.s) @ svd.vt
     mean = np.tile(mean, len(bands))
@@ -233,18 +275,7 @@ def prepare(
     variance = np.kron(np.diag(bands), np.diag(covariance)) - np.sum(
         even * (2 * pulled - even @ (weight @ pulled)), axis=1
     )
-    return Lmmse(
-        levels=levels,
-        even=even,
-        mean=mean,
-        offset=vectors.T @ (seen @ mean),
-        analysis=analysis,
-        power=power,
-        gain=cross @ vectors,
-        variance=variance,
-        noise=np.full(len(power), float(sigma) ** 2),
-        sigma=float(sigma),
-    )
+    return mean, vectors.T @ (seen @ mean), analysis, power, cross @ vectors, variance
 
 
 def _audible(

@@ -241,7 +241,9 @@ class _Judge:
         # in half the time where noise hides what single precision rounds off
         kind = np.float32 if lmmse.sigma > ROUNDED * bright else np.float64
         objects = np.tile(grey, max(1, len(system.bands))).astype(kind)
-        clear = np.asarray(objects @ system.own.T.astype(kind), float)
+        # one product of two matrices: in a stack of them each would read all of A
+        clear = objects.reshape(-1, objects.shape[-1]) @ system.own.T.astype(kind, copy=False)
+        clear = clear.astype(float).reshape(*objects.shape[:-1], -1)
         return cls(
             y=y,
             clear=clear,

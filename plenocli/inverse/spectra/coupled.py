@@ -23,8 +23,11 @@ MOST_CORRELATION = 0.98
 MOST = 2.0
 """Standard deviations by which neighbours' light is changed at most."""
 TURNS = 3
-KNOWN_TO = 0.035
-"""Share of what neighbours' light changes, over the array, by which the change may be wrong."""
+KNOWN_TO, OF_LIGHT = 0.035, 0.1
+"""Share of what neighbours' light changes, over the array, by which the change may be wrong, where
+that much of a band's light is the neighbours'; of more light by the root less, as of parts that are
+wrong each by itself.
+"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -205,7 +208,8 @@ def _answer(
     power = _error_power(system, capture, value) * share[..., None]
     power *= max(1.0, float(np.nanmedian(residual)))
     taken_off = np.nan_to_num(value - capture.start)
-    power += KNOWN_TO**2 * (taken_off**2).mean(axis=(0, 1))
+    wrong = KNOWN_TO**2 * OF_LIGHT / np.maximum(light.share, OF_LIGHT)
+    power += wrong * (taken_off**2).mean(axis=(0, 1))
     return LatticeAnswer(
         value=value,
         sigma=np.sqrt(power),

@@ -304,17 +304,25 @@ class LatticeSystem:
         scale: (pixel,), its standard deviation.
         b: the answer.
         """
+        from scipy.fft import irfft2, rfft2
+
         frequency = 2 * np.pi * np.fft.fftfreq(IMPULSE)
         assert self.prior is not None
         before = np.kron(self.prior.precision(frequency, frequency), self.prior.inverse)
         acts = self._acts(frequency, frequency)
         after = self._normal(acts, frequency, frequency)
         ruled_out = np.linalg.slogdet(after)[1] - np.linalg.slogdet(before)[1]
-        apart = self._reaching(b - self._even, np.ones(self.shape, bool), 0) @ self._along[1]
-        # the answer is where its prior pulls as much as what is left
-        pulled = (self.directions(left).reshape(apart.shape) * apart).sum()
-        lenslets = self.shape[0] * self.shape[1]
-        return float((((left / scale) ** 2).sum() + pulled) / lenslets + ruled_out.mean())
+        apart = self.mirrored(b - self._even, PAD).astype(np.float32)
+        spectrum = rfft2(apart, axes=(0, 1))
+        rows, columns = apart.shape[:2]
+        whole = 2 * np.pi * np.fft.fftfreq(rows), 2 * np.pi * np.fft.rfftfreq(columns)
+        precision = self.prior.precision(*whole).astype(np.complex64)
+        bands = len(self.prior.mean)
+        pulled = precision @ spectrum.reshape(*spectrum.shape[:2], -1, bands) @ self.prior.inverse
+        pull = irfft2(pulled.reshape(spectrum.shape), s=(rows, columns), axes=(0, 1))
+        inner = (slice(PAD, -PAD),) * 2
+        power = ((left / scale) ** 2).sum() + (apart[inner] * pull[inner]).sum()
+        return float(power / (self.shape[0] * self.shape[1]) + ruled_out.mean())
 
     @cached_property
     def impulse(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

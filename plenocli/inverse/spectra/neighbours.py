@@ -76,6 +76,12 @@ class NeighbourLight:
         """Which superpixel is the lenslet's own."""
         return int(np.flatnonzero((self.offsets == 0).all(axis=1))[0])
 
+    @property
+    def share(self) -> np.ndarray:
+        """(band,), of the light of even fields that falls on other superpixels than their own."""
+        light = self._even(self.light).sum(axis=1)
+        return 1 - light[self.own] / light.sum(axis=0)
+
     def changed(self, amounts: np.ndarray) -> NeighbourLight:
         """With `changes` by amounts (change,), in standard deviations."""
         return replace(self, light=self.light + np.tensordot(amounts, self.changes, 1))

@@ -229,6 +229,24 @@ def test_noiseless_values_come_back_to_the_border():
     np.testing.assert_allclose(found.value, truth[:, :, 0], atol=1e-3)
 
 
+def test_errors_of_much_neighbours_light_are_not_in_its_proportion(monkeypatch):
+    """Of light that is wrong in parts, each by itself, error power goes as the light."""
+    truth, wrong = each_its_own((16, 16)), []
+    for strength in (4.0, 16.0):
+        light = lattice_light(strength)
+        share = 1 - light.light[4].sum(axis=(0, 1)) / light.light.sum(axis=(0, 1, 2))
+        assert (share > 0.1).all()
+        shot = capture(light, truth)
+        found = coupled(shot, light, fit=False)
+        with monkeypatch.context() as known:
+            known.setattr("plenocli.inverse.spectra.coupled.KNOWN_TO", 0.0)
+            sure = coupled(shot, light, fit=False)
+        changed = ((found.value - shot.start) ** 2).mean(axis=(0, 1))
+        more = (found.sigma**2 - sure.sigma**2).mean(axis=(0, 1))
+        wrong.append(more / changed * share)
+    np.testing.assert_allclose(wrong[1], wrong[0], rtol=1e-6)
+
+
 @pytest.mark.parametrize("strength", [0.6, 1.3])
 def test_the_size_of_neighbours_light_is_fitted(strength):
     truth, assumed = each_its_own((20, 20)), lattice_light()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations_with_replacement
 from math import prod
 
 import numpy as np
@@ -319,18 +320,47 @@ def surfaces_of(x: np.ndarray, along: np.ndarray, down: float) -> Surfaces:
     deep = np.gradient(smooth, axis=0) if len(x) > 1 else np.zeros_like(x)
     across = (np.roll(smooth, -1, axis) - np.roll(smooth, 1, axis) for axis in (1, 2))
     gradient = [depth * deep, *(w / 2 * part for w, part in zip(wide[1:], across))]
-    pairs = list(zip(*np.triu_indices(3)))
-    means = [gaussian_filter(gradient[i] * gradient[j], ABOUT * wide, mode=edges) for i, j in pairs]
+    means = {
+        (i, j): gaussian_filter(gradient[i] * gradient[j], ABOUT * wide, mode=edges)
+        for i, j in combinations_with_replacement(range(3), 2)
+    }
     normal, free = np.empty((3, *x.shape), x.dtype), np.empty_like(x)
-    tensor, least = np.empty((*x.shape[1:], 3, 3), x.dtype), np.finfo(x.dtype).tiny
     for plane in range(len(x)):
-        for (i, j), mean in zip(pairs, means):
-            tensor[..., i, j] = tensor[..., j, i] = mean[plane]
-        values, vectors = np.linalg.eigh(tensor)
-        ratio = np.maximum(values[..., 1], 0) / np.maximum(values[..., 2], least)
-        free[plane] = np.maximum(1 - 2 * ratio, 0)
-        normal[:, plane] = np.moveaxis(vectors[..., 2], -1, 0)
+        tensor = {at: mean[plane].astype(float) for at, mean in means.items()}
+        normal[:, plane], free[plane] = _one_way(tensor)
     return Surfaces((normal[0], normal[1], normal[2]), free)
+
+
+def _one_way(tensor: dict[tuple[int, int], np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Of symmetric 3 x 3 matrices, none below zero, given by their upper half: the eigenvector of
+    the greatest eigenvalue, (3, ..), and max(1 - 2 (second over greatest), 0).
+
+    By the roots of the characteristic polynomial and the greatest column of the adjugate, which
+    stands well above rounding wherever the second number is not 0; else the vector is of no use.
+    """
+    a, b, c, d, e, f = (tensor[at] for at in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)))
+    tiny = np.finfo(float).tiny
+    unit = np.maximum(a + d + f, tiny)
+    a, b, c, d, e, f = (part / unit for part in (a, b, c, d, e, f))
+    mean = (a + d + f) / 3
+    spread = np.sqrt(((a - d) ** 2 + (d - f) ** 2 + (f - a) ** 2) / 18 + (b**2 + c**2 + e**2) / 3)
+    a, d, f = a - mean, d - mean, f - mean
+    turn = a * (d * f - e * e) - b * (b * f - c * e) + c * (b * e - c * d)
+    angle = np.arccos(np.clip(turn / np.maximum(2 * spread**3, tiny), -1, 1)) / 3
+    greatest = 2 * spread * np.cos(angle)
+    second = 2 * spread * np.cos(angle - 2 * np.pi / 3)
+    free = np.maximum(1 - 2 * (second + mean) / np.maximum(greatest + mean, tiny), 0)
+    a, d, f = a - greatest, d - greatest, f - greatest
+    columns = np.array(
+        [
+            [d * f - e * e, c * e - b * f, b * e - c * d],
+            [c * e - b * f, a * f - c * c, b * c - a * e],
+            [b * e - c * d, b * c - a * e, a * d - b * b],
+        ]
+    )
+    square = np.einsum("ij...,ij...->j...", columns, columns)
+    found = np.take_along_axis(columns, square.argmax(axis=0)[None, None], axis=1)[:, 0]
+    return found / np.sqrt(np.maximum(square.max(axis=0), tiny)), free
 
 
 def shrunk(

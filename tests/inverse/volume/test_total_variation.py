@@ -11,6 +11,7 @@ from plenocli.base.linear_maps import BlockCirculant
 from plenocli.inverse.volume.measurement import Measurement, Problem, Voxels
 from plenocli.inverse.volume.total_variation import (
     Surfaces,
+    _one_way,
     back_differences,
     differences,
     least_variation,
@@ -227,6 +228,30 @@ def test_surfaces_are_where_a_volume_changes_one_way(spacing):
     assert cosine.min() > 0.98 and seen.free[middle].min() > 0.9
     bead = np.exp(-(deep**2 + down**2 + right**2) / 8)
     assert surfaces_of(bead, along, 1.0).free[7, 12, 12] < 0.3
+
+
+@pytest.mark.parametrize("scale", [1e-30, 1.0, 1e30])
+def test_the_greatest_eigenvector_is_that_of_lapack(scale):
+    """Of random matrices, of rank one or nearly, of equal eigenvalues, diagonal, and of nothing."""
+    rng = np.random.default_rng(11)
+    vectors = np.linalg.qr(rng.standard_normal((4000, 3, 3)))[0]
+    values = rng.random((4000, 3)) ** rng.choice([1, 4, 30], (4000, 1))
+    values[:200, 1:] = 0
+    values[200:400, 1] = values[200:400, 0]
+    values[400:500] = 0.3
+    vectors[500:700] = np.eye(3)[rng.permutation(3)]
+    values[700] = 0
+    matrices = scale * np.einsum("nij,nj,nkj->nik", vectors, values, vectors)
+    upper = {(i, j): matrices[:, i, j] for i, j in zip(*np.triu_indices(3))}
+    normal, free = _one_way(upper)
+    expected, axes = np.linalg.eigh(matrices / scale)
+    ratio = np.maximum(expected[:, 1], 0) / np.maximum(expected[:, 2], 1e-300)
+    np.testing.assert_allclose(free[:700], np.maximum(1 - 2 * ratio, 0)[:700], atol=1e-7)
+    matters = free > 1e-3
+    matters[700] = False
+    cosine = np.abs(np.sum(normal.T * axes[:, :, 2], axis=1))
+    assert matters.sum() > 1500 and cosine[matters].min() > 1 - 1e-12
+    assert np.isfinite(normal).all() and np.isfinite(free).all()
 
 
 def test_a_sheet_aslant_is_found_better(monkeypatch):

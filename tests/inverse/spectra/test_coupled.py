@@ -159,6 +159,27 @@ def test_superpixels_come_back_to_the_border_whatever_the_tiles(shape, monkeypat
         assert np.sqrt((part**2).mean()) < 0.5
 
 
+def test_evidence_counts_the_distance_from_the_prior_of_mirrored_lenslets():
+    """Against the precision of all points of a ring of the lenslets and their mirror images."""
+    rows, columns = shape = (4, 3)
+    prior = PointPrior(mean=np.full(BANDS, 0.4), inverse=np.diag([30.0, 50.0]), rho=0.6, modes=ALL)
+    blocks = lattice_light().light.reshape(9, PIXELS, -1)
+    system = LatticeSystem(blocks, OFFSETS, np.full(PIXELS, 400.0), shape, prior)
+    points = np.random.default_rng(13).uniform(0.1, 0.8, (rows, columns, POINTS**2, BANDS))
+    picture = points.reshape(rows, columns, POINTS, POINTS, BANDS).swapaxes(1, 2)
+    picture = picture.reshape(rows * POINTS, columns * POINTS, BANDS) - 0.4
+    for axis in (0, 1):
+        picture = np.concatenate([picture, np.flip(picture, axis)], axis=axis)
+    ring = picture.reshape(2 * rows, POINTS, 2 * columns, POINTS, BANDS).swapaxes(1, 2).ravel()
+    expected = ring @ along_the_ring(prior, (2 * rows, 2 * columns)) @ ring / 4
+    left, even = np.zeros((*shape, PIXELS)), np.full((*shape, POINTS**2 * BANDS), 0.4)
+    found, none = (system.surprise(left, 1.0, b) for b in (points.reshape(*shape, -1), even))
+    assert (found - none) * rows * columns == pytest.approx(expected, rel=1e-4)
+    # and that of what is left over, of unit variance, is its count
+    left = np.random.default_rng(14).normal(0, 3, (*shape, PIXELS))
+    assert system.surprise(left, 3.0, even) - none == pytest.approx((left**2).sum() / 9 / 12)
+
+
 def test_the_prior_is_an_exponential_correlation_of_points():
     """On a ring that is long beside it; the two forms of the precision agree."""
     prior = PointPrior(mean=np.zeros(1), inverse=np.array([[4.0]]), rho=0.5**3, modes=ALL)

@@ -30,6 +30,8 @@ BLUR, ABOUT = 1.0, 1.5
 """Pitches of voxels over which a volume is smoothed, and about a voxel, to see surfaces."""
 LITTLE = 1e-2
 """Share of a volume's variation below which another one explains none of it."""
+VETO = 0.1
+"""Share by which a volume that is like another one may have a larger held-out error."""
 GAIN = 0.01
 """Share by which weaker total variation must make the held-out error smaller to be preferred."""
 
@@ -48,7 +50,8 @@ def total_variation(
         without such pixels the weakest.
     rounds: at that one, after those that chose it.
     like: (plane, row, column) a volume of the same voxels, of another colour: as many rounds more
-        with TV(x - f like), least over f >= 0 as well, where that is LITTLE less than TV(x).
+        with TV(x - f like), least over f >= 0 as well, where that is LITTLE less than TV(x) and
+        held-out pixels do not object.
 
     Returns a volume without sigma.
     Raises NumericsError where memory is lacking.
@@ -73,6 +76,7 @@ def total_variation(
         state, least, chosen = tried, misfit, strength
     state = descent.last(state, chosen, rounds)
     trace.append(Trial(f"strength {chosen:g}, to the end", problem.misfit(state.light)))
+    u, light = state.u, state.light
     likeness = None if like is None else descent.tie_to(like, state)
     if like is not None and likeness is not None and likeness.factor:
         stronger = chosen / max(1 - likeness.share, LITTLE)
@@ -80,15 +84,20 @@ def total_variation(
             state = descent.last(state, stronger, min(LOOKED_AT, rounds))
             likeness = descent.tie_to(like, state)
         told = f"of what is not {likeness.factor:.3g} of the other volume"
+        alone = trace[-1].misfit
         trace.append(Trial(told, problem.misfit(state.light)))
+        if trace[-1].misfit > (1 + VETO) * alone:
+            likeness = Likeness(factor=0.0, share=0.0)
+        else:
+            u, light = state.u, state.light
     return Volume(
-        value=problem.inside(problem.voxels.lenslets(state.u)),
+        value=problem.inside(problem.voxels.lenslets(u)),
         sigma=None,
         method="tv",
         trace=tuple(trace),
         background=float(problem.measurement.offset.mean()),
         prior=None,
-        held_out=problem.judged(state.light),
+        held_out=problem.judged(light),
         margin=problem.margin,
         likeness=likeness,
     )

@@ -67,7 +67,7 @@ class VolumeSummary(Record):
                 f"; {self.like_factor:.3g} of the other volume is {self.like_share:.0%} of what "
                 "varies"
                 if self.like_factor
-                else "; it has no structure of the other volume, and is not tied to it"
+                else "; it is not tied to the other volume, whose structure it does not show"
             )
         return f"{text}; {self.margin} lenslets along the border miss light"
 

@@ -53,6 +53,20 @@ def test_what_a_clearer_colour_shows_helps_another(name):
     assert error(tied, truth) < least * error(alone, truth)
 
 
+def test_held_out_pixels_may_object(monkeypatch):
+    """Then it is the volume without the other, and the trace has what was tried."""
+    other = total_variation(seen(specimen(1), 0.3, 3, kernels=1)).value
+    problem = seen(specimen(1), 0.01, 4)
+    alone, tied = total_variation(problem), total_variation(problem, like=other)
+    assert tied.likeness.factor > 0.3 and not np.array_equal(tied.value, alone.value)
+    assert tied.trace[-1].misfit < tied.trace[-2].misfit
+    monkeypatch.setattr("plenocli.inverse.volume.total_variation.VETO", -0.5)
+    vetoed = total_variation(problem, like=other)
+    assert vetoed.likeness.factor == 0 and np.array_equal(vetoed.value, alone.value)
+    assert np.array_equal(vetoed.held_out.predicted, alone.held_out.predicted)
+    assert [trial.what for trial in vetoed.trace] == [trial.what for trial in tied.trace]
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_another_structure_changes_nothing(seed):
     problem = seen(specimen(10 + seed), 0.1, 4)

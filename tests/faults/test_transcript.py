@@ -63,6 +63,7 @@ def answer(runner, folder, entry):
     text = re.sub(r"[\d.]+(?=[KMG]iB)", "#", text)  # what is needed changes with the laws of cost
     # a residual that is nothing but rounding, and a file as long as the digits of its figures
     text = re.sub(r"(?<=equations only to )[\d.e-]+", "#", text)
+    text = re.sub(r"(?<=validation )[\d.]+(?= dB)", "#", text)  # by a step that is near rounding
     text = re.sub(r"\d+ bytes where \d+", "# bytes where #", text)
     text += f"\n(leaves {', '.join(path.name for path in left)})" if left else ""
     return f"$ {entry}\n[{outcome.code}] {text.rstrip()}\n", outcome.notes

@@ -248,12 +248,12 @@ class BlockCirculant:
         if not isinstance(matrices, np.ndarray):
             x = times(inverse, times_adjoint(matrices, y) + pull)
             return x, times(matrices, x)
-        x, light = np.empty_like(pull), np.empty_like(y)
+        x, light, mirrored = np.empty_like(pull), np.empty_like(y), y.conj()
 
         def work(share: slice) -> None:
             for low in range(share.start, min(share.stop, len(x)), CACHED):
                 part = slice(low, min(low + CACHED, share.stop))
-                back = np.matmul(y[part, None, :].conj(), matrices[part])[:, 0].conj() + pull[part]
+                back = np.matmul(mirrored[part, None, :], matrices[part])[:, 0].conj() + pull[part]
                 np.matmul(inverse[part], back[:, :, None], out=x[part, :, None])
                 np.matmul(matrices[part], x[part, :, None], out=light[part, :, None])
 

@@ -59,9 +59,9 @@ def gain_of(
             for k in some:
                 mixing, root = lattice.mixing[k], factor[k]
                 t, w = _one(scale * op.spectrum[k], mixing, root)
-                matrix[k] = t.astype(matrix.dtype) @ w.astype(matrix.dtype)
+                matrix[k] = t.astype(matrix.dtype) @ w.astype(matrix.dtype).conj().T
                 variance[k] = _squares(t, 1)
-                leverage[k] = _squares(w, 0)
+                leverage[k] = _squares(w, 1)
                 shown.update()
 
         step = max(1, frequencies // 32)
@@ -75,15 +75,16 @@ def gain_of(
 
 
 def _one(matrix: np.ndarray, mixing: np.ndarray, root: np.ndarray) -> tuple[np.ndarray, ...]:
-    """T (unknown, mode) and R^-1 B' (mode, pixel) of one frequency."""
-    from scipy.linalg.blas import zherk
+    """T (unknown, mode) and B R^-H (pixel, mode) of one frequency."""
+    from scipy.linalg.blas import zherk, ztrmm
     from scipy.linalg.lapack import zpotrf, ztrtri
 
     b = np.asfortranarray(through_prior(matrix, mixing, root))
     gram = zherk(1.0, b, trans=2, lower=1)
     gram[np.diag_indices_from(gram)] += 1
     inverse = ztrtri(zpotrf(gram, lower=1, clean=1)[0], lower=1)[0]
-    return back_through_prior(inverse.conj().T, mixing, root), inverse @ b.conj().T
+    t = back_through_prior(inverse.conj().T, mixing, root)
+    return t, ztrmm(1.0, inverse, b, side=1, lower=1, trans_a=2, overwrite_b=1)
 
 
 def _squares(array: np.ndarray, axis: int) -> np.ndarray:

@@ -11,7 +11,7 @@ import numpy as np
 
 from plenocli.base.budget import budget, spread
 from plenocli.base.progress import bar
-from plenocli.inverse.volume.lattice import Lattice, back_through_prior, lattice_of, through_prior
+from plenocli.inverse.volume.lattice import Lattice, lattice_of
 from plenocli.inverse.volume.lmmse import class_variance
 from plenocli.inverse.volume.measurement import Problem
 from plenocli.inverse.volume.volume import Likeness, Trial, Volume
@@ -416,33 +416,36 @@ def _beyond(new: np.ndarray, old: np.ndarray) -> np.ndarray:
 def _inverses(
     problem: Problem, lattice: Lattice, scale: np.ndarray, along: np.ndarray, down: float
 ) -> np.ndarray:
-    """(A' A + p D' D + q)^-1 of every frequency, (frequency, unknown, unknown), made in double
-    precision and stored as the map is.
+    """(A' A + p D' D + q)^-1 of every frequency, (frequency, unknown, unknown), in the precision of
+    the map: no eigenvalue is below q, so that its rounding is that of A' A itself.
     """
-    from scipy.linalg.blas import zherk
-    from scipy.linalg.lapack import zpotrf, ztrtri
+    from scipy.linalg import get_blas_funcs, get_lapack_funcs
 
     spectrum, planes = problem.op.spectrum, len(problem.voxels.depths)
     frequencies, _, unknowns = spectrum.shape
     points = unknowns // planes
+    herk = get_blas_funcs("herk", dtype=spectrum.dtype)
+    potrf, potri = get_lapack_funcs(("potrf", "potri"), dtype=spectrum.dtype)
     inverse = np.empty((frequencies, unknowns, unknowns), spectrum.dtype)
     step = along[:, None] * np.diff(np.eye(planes), axis=0)
-    axial = np.kron(np.eye(points), PENALTY * step.T @ step)
-    independent = np.broadcast_to(np.eye(planes), (points, planes, planes))
-    across = 4 * np.sin(np.pi * lattice.turns) ** 2 @ [down**2, 1.0]
-    diagonal = np.diag_indices(unknowns)
+    own = np.kron(PENALTY * step.T @ step + SIGN * np.eye(planes), np.eye(points))
+    own = own.astype(scale.dtype)
+    each = np.arange(planes)
 
     with bar(None, frequencies, "steps") as shown:
 
         def work(some: range) -> None:
             for k in some:
-                b = through_prior(scale[:, None] * spectrum[k], lattice.mixing[k], independent)
-                gram = zherk(1.0, np.asfortranarray(b), trans=2, lower=1) + axial
-                gram[diagonal] += SIGN + PENALTY * np.repeat(across[k], planes)
-                root = ztrtri(zpotrf(gram, lower=1, clean=1)[0], lower=1)[0]
-                t = back_through_prior(root.conj().T, lattice.mixing[k], independent)
-                t = t.astype(spectrum.dtype)
-                inverse[k] = t @ t.conj().T
+                mixing = lattice.mixing[k]
+                across = PENALTY * 4 * np.sin(np.pi * lattice.turns[k]) ** 2 @ [down**2, 1.0]
+                # columns first, the lower triangle: rows first it is the upper one of A' A
+                gram = herk(1.0, (scale[:, None] * spectrum[k]).T, lower=1).T
+                gram += own
+                layers = gram.reshape(planes, points, planes, points)
+                layers[each, :, each] += mixing * across @ mixing.conj().T
+                root = potrf(gram.T, lower=1, overwrite_a=1)[0]
+                upper = np.triu(potri(root, lower=1, overwrite_c=1)[0].T)
+                inverse[k] = upper + np.triu(upper, 1).conj().T
                 shown.update()
 
         share = max(1, frequencies // 32)

@@ -41,18 +41,21 @@ def put(text, before, name, code):
     return f"{head}{entries},\n{code}{rest[end:]}"
 
 
-def followed(title, folder):
-    """A copy of the package and its tests of the house in which a recipe was followed."""
+def copied(folder):
+    """A copy of the package and its tests of the house."""
     ignored = shutil.ignore_patterns("__pycache__", "samples")
     shutil.copytree(ROOT / "plenocli", folder / "plenocli", ignore=ignored)
     (folder / "tests").mkdir()
     shutil.copy(ROOT / "tests" / "test_architecture.py", folder / "tests")
     shutil.copytree(ROOT / "docs", folder / "docs")
+
+
+def follow(title, folder):
+    """Do in a copy what a recipe says."""
     for file, into, code in recipe(title):
         place = folder / file
         assert place.exists() == (into is not None)
         place.write_text(put(place.read_text(), *into, code) if into else code)
-    return folder
 
 
 def run(folder, *arguments):
@@ -62,9 +65,7 @@ def run(folder, *arguments):
     return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
 
 
-@pytest.fixture
-def tiny():
-    return str(ROOT / "sample_configs" / "tiny.toml")
+TINY = str(ROOT / "sample_configs" / "tiny.toml")
 
 
 def house_stands(folder):
@@ -74,19 +75,18 @@ def house_stands(folder):
     return True
 
 
-def test_a_command(tmp_path, tiny):
-    folder = followed("Add a command", tmp_path)
-    done = run(folder, "plenocli", "f-number", tiny, "--json")
+def a_command_works(folder):
+    """That of the first recipe."""
+    done = run(folder, "plenocli", "f-number", TINY, "--json")
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout) == {"camera": "tiny.toml", "f_number": pytest.approx(8)}
     assert "f-number" in run(folder, "plenocli", "--help").stdout
-    assert house_stands(folder)
 
 
-def test_a_model_of_propagation(tmp_path, tiny):
-    folder = followed("Add a model of propagation", tmp_path)
+def a_model_of_propagation_works(folder):
+    """That of the second."""
     square = (
-        Path(tiny).read_text().replace("[main_lens]", '[main_lens]\naperture_shape = "square"', 1)
+        Path(TINY).read_text().replace("[main_lens]", '[main_lens]\naperture_shape = "square"', 1)
     )
     (folder / "square.toml").write_text(square)
     made = run(
@@ -106,16 +106,15 @@ def test_a_model_of_propagation(tmp_path, tiny):
     summary = json.loads(made.stdout)
     assert summary["rung"] == "pinholes" and summary["rank"] == [1]
     assert summary["energy_min"] == summary["energy_max"] == [pytest.approx(1, abs=1e-6)]
-    assert house_stands(folder)
 
 
-def test_a_method_of_reconstruction(tmp_path, tiny):
-    folder = followed("Add a method of reconstruction", tmp_path)
+def a_method_of_reconstruction_works(folder):
+    """That of the third."""
     steps = (
-        ("simulate-pif", tiny, "--accuracy", "0.1", "-o", "pif.h5"),
+        ("simulate-pif", TINY, "--accuracy", "0.1", "-o", "pif.h5"),
         (
             "capture-sim",
-            tiny,
+            TINY,
             "--scene",
             "skimage:camera",
             "--pif",
@@ -155,4 +154,16 @@ def test_a_method_of_reconstruction(tmp_path, tiny):
     )
     assert score.returncode == 0, score.stderr
     assert json.loads(score.stdout)["metrics"]["psnr_db"] > 10
-    assert house_stands(folder)
+
+
+def test_the_recipes_do_what_they_say(tmp_path):
+    """One after the other in one copy, which is compiled once."""
+    copied(tmp_path)
+    for title, works in {
+        "Add a command": a_command_works,
+        "Add a model of propagation": a_model_of_propagation_works,
+        "Add a method of reconstruction": a_method_of_reconstruction_works,
+    }.items():
+        follow(title, tmp_path)
+        works(tmp_path)
+    assert house_stands(tmp_path)

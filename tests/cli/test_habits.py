@@ -15,6 +15,8 @@ from pathlib import Path
 
 import pytest
 
+from plenocli.cli.main import run
+
 ROOT = Path(__file__).resolve().parents[2]
 ENVIRONMENT = {k: v for k, v in os.environ.items() if not k.startswith("_PLENOCLI")} | {
     "PATH": os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]]),
@@ -167,41 +169,12 @@ def test_quiet_reaches_the_workers(folder, workers):
     assert (done.returncode, done.stderr) == (0, "")
     pictures = folder / f"pictures{workers}"
     if not (folder / "pif.h5").exists():
-        run = [
-            [
-                "simulate-pif",
-                "camera.toml",
-                "--model",
-                "ray",
-                "--superpixels",
-                "1x1",
-                "-o",
-                "pif.h5",
-            ],
-            *(
-                [
-                    "capture-sim",
-                    "camera.toml",
-                    "--scene",
-                    "skimage:coins",
-                    "--superpixels",
-                    "1x1",
-                    "--model",
-                    "ray",
-                    "--snr",
-                    "60dB",
-                    "--seed",
-                    s,
-                    "-o",
-                    f"view{s}.h5",
-                ]
-                for s in "12"
-            ),
-        ]
-        for one in run:
-            subprocess.run(
-                [*PLENOCLI, *one], cwd=folder, env=ENVIRONMENT, check=True, capture_output=True
-            )
+        camera, by_rays = str(folder / "camera.toml"), ["--model", "ray", "--superpixels", "1x1"]
+        assert run(["simulate-pif", camera, *by_rays, "-o", str(folder / "pif.h5")]) == 0
+        for seed in "12":
+            asked = ["--scene", "skimage:coins", *by_rays, "--snr", "60dB", "--seed", seed]
+            view = str(folder / f"view{seed}.h5")
+            assert run(["capture-sim", camera, *asked, "-o", view]) == 0
     loud = [
         *PLENOCLI,
         "reconstruct",

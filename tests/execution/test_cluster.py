@@ -15,6 +15,8 @@ import pytest
 from plenocli.base.errors import UsageError
 from plenocli.cli.main import run
 from plenocli.files.artefacts.container import Artefact, write_artefact
+from plenocli.inverse.picture.methods import per_lenslet
+from plenocli.stages.inverse import reconstruct
 
 pytest.importorskip("distributed")
 pytestmark = pytest.mark.filterwarnings("default")  # what Dask's own threads warn of is not ours
@@ -101,28 +103,6 @@ def described(folder):
         'method = "tikhonov"\n'
     )
     return folder / "sweep.toml"
-
-
-TWO_A_BATCH = """
-import sys
-from plenocli.cli.main import run
-from plenocli.inverse.picture.methods import per_lenslet
-from plenocli.stages.inverse import reconstruct
-
-if __name__ == "__main__":
-    # nine lenslets: five batches
-    per_lenslet.NNLS_BATCH = per_lenslet.NNLS_CONVERGED_BATCH = per_lenslet.DICTIONARY_BATCH = 2
-    sent, send = [], reconstruct._solve_in_pool
-
-    def noted(recipe, pool, solve, batches, options):
-        sent.extend(batches)
-        return send(recipe, pool, solve, batches, options)
-
-    reconstruct._solve_in_pool = noted
-    code = run(sys.argv[1:])
-    print(len(sent))
-    sys.exit(code)
-"""
 
 
 def same(table, other):
@@ -362,33 +342,26 @@ def test_batches_of_the_lenslets_of_one_capture_give_the_bytes_of_one_process(
             )
             == 0
         )
-    sent = {}
+    # nine lenslets: five batches
+    for name in ("NNLS_BATCH", "NNLS_CONVERGED_BATCH", "DICTIONARY_BATCH"):
+        monkeypatch.setattr(per_lenslet, name, 2)
+    sent, noted, send = {}, [], reconstruct._solve_in_pool
+
+    def sending(recipe, pool, solve, batches, options):
+        noted.extend(batches)
+        return send(recipe, pool, solve, batches, options)
+
+    monkeypatch.setattr(reconstruct, "_solve_in_pool", sending)
+    asked = ["reconstruct", "view.h5", "--pif", "pif.h5", "--method", *method]
     for name, options in {
         "here": [],
         "there": ["--scheduler", str(known)],
         "beside": ["--workers", "2"],
     }.items():
-        words = [
-            "reconstruct",
-            "view.h5",
-            "--pif",
-            "pif.h5",
-            "--method",
-            *method,
-            *options,
-            "-o",
-            f"{name}.h5",
-        ]
-        done = subprocess.run(
-            [sys.executable, "-c", TWO_A_BATCH, *words],
-            env=os.environ | {"PYTHONPATH": str(ROOT)},
-            capture_output=True,
-            text=True,
-            timeout=200,
-        )
-        assert done.returncode == 0, done.stderr
-        sent[name] = done.stdout.split()[-1]
-    assert sent == {"here": "0", "there": "5", "beside": "5"}, (
+        noted.clear()
+        assert run([*asked, *options, "-o", f"{name}.h5"]) == 0
+        sent[name] = len(noted)
+    assert sent == {"here": 0, "there": 5, "beside": 5}, (
         "only the two with workers send batches out"
     )
     assert len({Path(f"{name}.h5").read_bytes() for name in ("here", "there", "beside")}) == 1

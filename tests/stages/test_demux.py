@@ -312,11 +312,12 @@ white_exposure = "40 ms"
 """
 
 
-def test_a_dark_frame_takes_off_what_the_sensor_makes_without_light(tmp_path):
+def test_a_dark_frame_takes_off_what_the_sensor_makes_without_light(tmp_path, monkeypatch):
     """Dark current, its fixed pattern and hot pixels, in every frame: with a dark frame spectra are
     those of a sensor without them, but for the dark current's shot noise; without one they are
     not.
     """
+    monkeypatch.setenv("PLENOCLI_CACHE", str(tmp_path / "cache"))  # matrices once a camera
     text = (
         Path(__file__).resolve().parents[2] / "sample_configs" / "demo_spectral.toml"
     ).read_text()

@@ -32,6 +32,7 @@ def folder(tmp_path_factory):
     camera = small_camera(lenslet_array__count=(COUNT, COUNT), main_lens__field=rows)
     (where / "camera.toml").write_text(to_toml(camera))
     isolated = ["--superpixels", "1x1", "--coherent-ring", "0", "--accuracy", "1e-2"]
+    isolated += ["--model", "fresnel"]
     simulate = ["simulate-pif", str(where / "camera.toml"), *isolated]
     assert run([*simulate, "-o", str(where / "one.h5")]) == 0
     assert run([*simulate, "--field-nodes", "auto", "-o", str(where / "field.h5")]) == 0

@@ -16,9 +16,10 @@ from plenocli.forward.scene.scenes import Uniform
 from plenocli.forward.scene.white_reference import REFERENCE_REFLECTANCE
 from plenocli.forward.sensor.exposure import ExposureOptions, StoredMatrix, simulate_capture
 from plenocli.inverse.calibration.measure import NarrowBands, calibrate
+from plenocli.inverse.spectra import neighbours
 from plenocli.inverse.spectra.crosstalk import METHODS, Crosstalk, windows_of
 from plenocli.inverse.spectra.demultiplexer import Demultiplexer
-from plenocli.inverse.spectra.neighbours import POINTS, neighbour_light
+from plenocli.inverse.spectra.neighbours import POINTS
 from plenocli.inverse.spectra.radiance import readout
 from plenocli.inverse.spectra.responses import LensletResponses
 
@@ -94,6 +95,25 @@ def bench():
     return described, calibration, white, shoot
 
 
+@pytest.fixture(scope="module", autouse=True)
+def predicted_once():
+    """Neighbours' light, which takes longest by far, once for each camera and response: what is
+    said beside these, noise figures and notes, it does not depend on.
+    """
+    predict, found = neighbours.neighbour_light, {}
+
+    def known(camera, calibration):
+        response = calibration.response
+        asked = (camera, *(v.tobytes() for v in (response.matrix, response.wavelengths)))
+        if asked not in found:
+            found[asked] = predict(camera, calibration)
+        return found[asked]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(neighbours, "neighbour_light", known)
+        yield
+
+
 @pytest.fixture(scope="module")
 def solve(bench):
     """solve(shot, method): reflectances, by one prediction for all."""
@@ -162,7 +182,7 @@ def test_fine_is_left_out_where_the_response_is_predicted(bench):
 def test_neighbours_light_comes_from_their_near_edges(bench):
     """Of parts of a field, whatever order the prediction works its points out in."""
     camera, calibration, _, _ = bench
-    found = neighbour_light(camera, calibration)
+    found = neighbours.neighbour_light(camera, calibration)
     for step in ((-1, 0), (1, 0), (0, -1), (0, 1)):
         which = np.flatnonzero((found.offsets == step).all(axis=1))[0]
         modes, light = found.modes, found.light[which].sum(axis=0)
@@ -196,7 +216,7 @@ def test_own_responses_of_lenslets_give_what_a_shared_one_does(bench, solve, che
         response=replace(calibration.response, matrix=calibration.response.matrix * gain),
     )
     one, many = LensletResponses.of(calibration), LensletResponses.of(own)
-    light = neighbour_light(camera, calibration)
+    light = neighbours.neighbour_light(camera, calibration)
     signal, noise = readout(shot, one, "x")
     values = windows_of(one, signal)
     shared = Crosstalk(one, light, values, noise).first.value
@@ -218,10 +238,10 @@ def test_what_cannot_be_predicted_is_said(bench, capsys):
     assert "one by one" in capsys.readouterr().err
     turned = camera.replace(**{"filter_array.filters": camera.filter_array.filters[::-1]})
     with pytest.raises(ConfigError, match="differs by"):
-        neighbour_light(turned, calibration)
+        neighbours.neighbour_light(turned, calibration)
     near = camera.replace(**{"object.distance": 1.5 * camera.main_lens.focal_length})
     with pytest.raises(ConfigError, match="lenslets in a row, of which 5 are followed"):
-        neighbour_light(near, calibration)
+        neighbours.neighbour_light(near, calibration)
 
 
 def test_without_noise_figures_pixels_are_not_weighed(bench, checkerboard):

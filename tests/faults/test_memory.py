@@ -334,7 +334,7 @@ def test_pictures_are_scored_and_drawn_in_the_memory_of_a_part_of_them(folder):
     assert all(peaks[n, 3300] - peaks[n, 1100] < 60 << 20 for n in range(3)), peaks
 
 
-@pytest.mark.parametrize("limit", [1, 20, 35])
+@pytest.mark.parametrize("limit", [1, 10, 15])
 def test_a_healthy_capture_is_told_what_it_needs_not_that_it_is_damaged(
     runner, stages, tmp_path, limit
 ):
@@ -364,7 +364,7 @@ def test_hdf5_without_memory_is_no_damage(tmp_path):
         "import resource\n"
         "from plenocli.files.artefacts.container import read_artefact\n"
         "used = int(open('/proc/self/statm').read().split()[5]) * resource.getpagesize()\n"
-        "resource.setrlimit(resource.RLIMIT_DATA, (used + (90 << 20), used + (90 << 20)))\n"
+        "resource.setrlimit(resource.RLIMIT_DATA, (used + (30 << 20), used + (30 << 20)))\n"
         "try: read_artefact('capture.h5')\n"
         "except MemoryError: raise SystemExit(7)\n"
     )

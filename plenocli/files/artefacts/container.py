@@ -3,8 +3,8 @@
 A file is a 512-byte user block (magic, SHA-256 and length of the rest), then an ordinary HDF5 file
 that any viewer opens. HDF5 never touches the disk, because it may crash the process when one is
 full: its frame is built in memory, with room for the large datasets, and frame and values are
-written by us (`stream` writes them as they come). Reading goes the other way: all bytes once,
-digest, structure, declared sizes, and only then values, parsed from those bytes.
+written by us (`stream` writes them as they come). Reading goes the other way: digest of all bytes,
+structure, declared sizes, and only then values.
 """
 
 from __future__ import annotations
@@ -12,12 +12,11 @@ from __future__ import annotations
 import contextlib
 import errno
 import hashlib
-import itertools
 import json
 import math
 import os
 import re
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -35,13 +34,11 @@ from plenocli.files.artefacts.kinds import SCHEMAS
 from plenocli.files.artefacts.provenance import (
     Provenance,
     first_bytes,
-    reading,
     require_file,
 )
 from plenocli.files.artefacts.sparse import Behind, SparseFile
 from plenocli.files.artefacts.structure import (
     EMPTY_AXIS,
-    READING,
     attribute_names,
     no_hdf5,
     read_attribute,
@@ -57,7 +54,6 @@ HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _HEADER = re.compile(re.escape(MAGIC) + rb"sha256 ([0-9a-f]{64})\nbytes (\d{1,18})\n\0*\Z")
 _CHUNK_BYTES = 1 << 20
 _READ_BYTES = 1 << 18
-_NUMBER = itertools.count()
 _LOOK_S, _SLOWEST = 10, 5 << 20
 """Processor time, s, in which HDF5 finds all objects of any file that is sound, and bytes a second
 that it unpacks at least.
@@ -129,8 +125,8 @@ def read_artefact(
     Raises InputError for a file that is missing, not an artefact, damaged, of another kind, or
     breaks its table; NumericsError for one that the memory of this process does not hold.
     """
-    path = Path(path)
-    return _parsed(path, _verified_bytes, kind, skip)
+    with opened_artefact(path, kind, skip) as (artefact, _):
+        return artefact
 
 
 def read_edited(path: str | os.PathLike) -> tuple[Artefact, str]:
@@ -139,35 +135,14 @@ def read_edited(path: str | os.PathLike) -> tuple[Artefact, str]:
     Raises as read_artefact, but for the digest.
     """
     path = Path(path)
-    budget().require_reading(path, READING * require_file(path))
+    require_file(path)
     header = _HEADER.fullmatch(first_bytes(path, HEADER_BYTES))
     if header is None:
         raise InputError(
             "is no artefact with a digest block", path, "edit it with a library that keeps it"
         )
-
-    def image(path: Path) -> memoryview:
-        return memoryview(path.read_bytes())[HEADER_BYTES:]
-
-    return _parsed(path, image, None, ()), header[1].decode()
-
-
-def _parsed(
-    path: Path,
-    image: Callable[[Path], memoryview],
-    kind: str | tuple[str, ...] | None,
-    skip: Collection[str],
-) -> Artefact:
-    """What the HDF5 part of a file, its `image`, holds; errors as read_artefact."""
-    with _as_input_error(path):
-        content = image(path)
-        seconds = _LOOK_S + len(content) // _SLOWEST
-        values = outside(compressed_values, path, sorted(skip), seconds=seconds)
-        # which keeps a copy: ours goes
-        opened = _open_image(content)
-        del content
-        with h5py.File(opened, "r") as file:
-            return _parse(path, file, kind, skip, values)
+    with _opened(path) as descriptor:
+        return _held(path, descriptor, None, ())[0], header[1].decode()
 
 
 # --- writing --------------------------------------------------------------------------------------
@@ -462,21 +437,6 @@ def _storage(values: np.ndarray | InParts) -> dict[str, Any]:
 # --- reading --------------------------------------------------------------------------------------
 
 
-def _verified_bytes(path: Path) -> memoryview:
-    """The HDF5 part of the file at `path`, read once, its digest and length verified."""
-    size = require_file(path)
-    if READING * size > budget().memory:
-        _require_whole(path, first_bytes(path, 4096), size)
-        budget().require_reading(path, READING * size)
-    with reading(path):
-        content = path.read_bytes()
-    digest = _require_whole(path, content[:4096], len(content))
-    image = memoryview(content)[HEADER_BYTES:]
-    if hashlib.sha256(image).hexdigest() != digest:
-        raise _damaged(path)
-    return image
-
-
 @dataclass(frozen=True, kw_only=True)
 class Stored:
     """A dataset that stays in its file, from which windows are read and checked.
@@ -532,30 +492,45 @@ def opened_artefact(
     """
     path = Path(path)
     size = require_file(path)
-    with contextlib.ExitStack() as stack:
-        with _as_input_error(path):
-            descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
-            stack.callback(os.close, descriptor)
-            digest = _require_whole(path, os.pread(descriptor, HEADER_BYTES, 0), size)
-            if verify:
-                if _digest_behind(descriptor) != digest:
-                    raise _damaged(path)
-            seconds = _LOOK_S + size // _SLOWEST
-            values = outside(compressed_values, path, sorted(apart), seconds=seconds)
-            file = stack.enter_context(h5py.File(Behind(descriptor, HEADER_BYTES), "r"))
-            artefact = _parse(path, file, kind, apart, values)
-            found = {
-                name: Stored(
-                    path=path,
-                    name=name,
-                    shape=file[name].shape,
-                    dtype=file[name].dtype,
-                    schema=SCHEMAS[artefact.kind],
-                )
-                for name in apart
-                if name in file
-            }
-        yield artefact, found
+    with _opened(path) as descriptor:
+        digest = _require_whole(path, os.pread(descriptor, HEADER_BYTES, 0), size)
+        if verify and _digest_behind(descriptor) != digest:
+            raise _damaged(path)
+        found = _held(path, descriptor, kind, apart)
+    yield found
+
+
+@contextlib.contextmanager
+def _opened(path: Path) -> Iterator[int]:
+    """A descriptor of the file at `path`; errors as read_artefact."""
+    with _as_input_error(path):
+        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+        try:
+            yield descriptor
+        finally:
+            os.close(descriptor)
+
+
+def _held(
+    path: Path, descriptor: int, kind: str | tuple[str, ...] | None, apart: Collection[str]
+) -> tuple[Artefact, dict[str, Stored]]:
+    """What the HDF5 part of an open file holds, as opened_artefact yields it."""
+    seconds = _LOOK_S + path.stat().st_size // _SLOWEST
+    values = outside(compressed_values, path, sorted(apart), seconds=seconds)
+    with h5py.File(Behind(descriptor, HEADER_BYTES), "r") as file:
+        artefact = _parse(path, file, kind, apart, values)
+        found = {
+            name: Stored(
+                path=path,
+                name=name,
+                shape=file[name].shape,
+                dtype=file[name].dtype,
+                schema=SCHEMAS[artefact.kind],
+            )
+            for name in apart
+            if name in file
+        }
+    return artefact, found
 
 
 @contextlib.contextmanager
@@ -610,18 +585,6 @@ def _require_whole(path: Path, head: bytes, size: int) -> str:
             "make it again",
         )
     return header[1].decode()
-
-
-def _open_image(image: bytes | memoryview) -> Any:
-    """Open the bytes of an HDF5 file; the block size saves the reallocations that
-    the default causes.
-    """
-    access = h5py.h5p.create(h5py.h5p.FILE_ACCESS)
-    access.set_fapl_core(max(len(image), 1), False)
-    access.set_file_image(image)
-    # HDF5 takes two images of one name, open at once in two threads, for one file and
-    # answers with the first
-    return h5py.h5f.open(b"artefact %d" % next(_NUMBER), h5py.h5f.ACC_RDONLY, access)
 
 
 def compressed_values(path: str, skip: list[str]) -> dict[str, np.ndarray]:

@@ -2,8 +2,9 @@
 datasets of one.
 """
 
+import re
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -73,8 +74,9 @@ def _attr(name: str, type: str, unit: str, doc: str, rare: Any = ()) -> Attr:
 
 
 def _schema(kind: str, table: dict[str, Any], known: Mapping[str, Schema]) -> Schema:
-    """The Schema of one table of kinds.toml; `known` holds those before it."""
-    like = known.get(table.get("like", ""), Schema(kind="", version=1, doc="", fields=()))
+    """The Schema of one table of kinds.toml; `known` holds the one that it takes over."""
+    none = Schema(kind="", version=1, doc="", fields=())
+    like = known[table["like"]] if "like" in table else none
     kept = (field for field in like.fields if field.path not in table.get("without", ()))
     attrs = dict(like.attrs)
     for where, rows in table.get("attributes", {}).items():
@@ -94,10 +96,29 @@ def _schema(kind: str, table: dict[str, Any], known: Mapping[str, Schema]) -> Sc
     )
 
 
-SCHEMAS: dict[str, Schema] = {}
-"""Kind -> its table."""
+class _Tables(Mapping[str, Schema]):
+    """The tables by kind, each parsed when it is first asked for: a command needs one or two."""
 
-for _kind, _table in tomllib.loads(
-    Path(__file__).with_name("kinds.toml").read_text("ascii")
-).items():
-    SCHEMAS[_kind] = _schema(_kind, _table, SCHEMAS)
+    def __init__(self, text: str) -> None:
+        starts = [*_KIND.finditer(text)]
+        ends = [start.start() for start in starts[1:]] + [len(text)]
+        self._texts = {s[1]: text[s.start() : end] for s, end in zip(starts, ends)}
+        self._made: dict[str, Schema] = {}
+
+    def __getitem__(self, kind: str) -> Schema:
+        if kind not in self._made:
+            table = tomllib.loads(self._texts[kind])[kind]
+            self._made[kind] = _schema(kind, table, self)
+        return self._made[kind]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._texts)
+
+    def __len__(self) -> int:
+        return len(self._texts)
+
+
+_KIND = re.compile(r"^\[([a-z-]+)\]$", re.MULTILINE)
+
+SCHEMAS: Mapping[str, Schema] = _Tables(Path(__file__).with_name("kinds.toml").read_text("ascii"))
+"""Kind -> its table."""

@@ -13,7 +13,6 @@ import numpy as np
 
 from plenocli.base.budget import budget
 from plenocli.base.errors import NumericsError
-from plenocli.files.artefacts.structure import READING
 from plenocli.forward.propagation import diagnosis
 
 if TYPE_CHECKING:
@@ -26,6 +25,10 @@ if TYPE_CHECKING:
 WHOLE_BYTES = 1 << 27
 """A matrix up to this size is held in memory while it is computed; larger ones go to
 the disk in pieces.
+"""
+ROOM = 3
+"""Times its size that whoever reads a matrix in one piece should have: itself, and what is made of
+it.
 """
 
 
@@ -68,7 +71,7 @@ def layout(plan: PifPlan, where: object) -> Layout:
     slab = plan.bytes // (bands * superpixels)
     streamed, needed = cost(plan)
     budget().require(needed, "the matrix", where, "take fewer superpixels, points or wavelengths")
-    if READING * plan.bytes <= budget().memory or superpixels == 1:
+    if ROOM * plan.bytes <= budget().memory or superpixels == 1:
         return Layout(streamed)
     size = max(1, budget().memory // 8 // (bands * slab))
     return Layout(

@@ -140,7 +140,8 @@ class Behind(io.RawIOBase):
         return self._place
 
     def readinto(self, buffer: Any) -> int:
-        view = memoryview(buffer).cast("B")
-        done = os.preadv(self._descriptor, [view], self._base + self._place)
-        self._place += done
-        return done
+        view, start = memoryview(buffer).cast("B"), self._place
+        # HDF5 does not look how much came, and a call brings 2 GiB at most
+        while view and (done := os.preadv(self._descriptor, [view], self._base + self._place)):
+            self._place, view = self._place + done, view[done:]
+        return self._place - start

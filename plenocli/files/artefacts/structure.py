@@ -93,15 +93,9 @@ def window(path: str, name: str, part: list[int]) -> dict[str, np.ndarray]:
         raise no_hdf5(path, error) from error
 
 
-READING = 3
-"""Times its size in memory at most while an artefact is read: the bytes, HDF5's own two copies
-of them while it opens, then the values.
-"""
-
-
 def no_hdf5(path: Name, error: Exception) -> Exception:
     """The error for what HDF5 says of a whole file: it does not say when it got no memory."""
-    if not can_have(READING * os.path.getsize(path) + (1 << 20)):
+    if not can_have(os.path.getsize(path) + (1 << 20)):
         return MemoryError(str(error))
     if isinstance(error, OSError) and error.errno:
         return InputError(f"cannot be read ({error.strerror})", path, "check the disk")

@@ -38,7 +38,8 @@ class Dark:
     @cached_property
     def flat(self) -> bool:
         """Whether the dark image is the black level everywhere."""
-        return bool((self.mean == tiled(self.black, self.mean.shape, self.mean.dtype)).all())
+        level = np.asarray(self.black, self.mean.dtype)
+        return all((self.mean[i::2, j::2] == level[i, j]).all() for i, j in np.ndindex(2, 2))
 
     def growth(self, exposure: float | None) -> np.float32 | None:
         """Factor by which the part above the black level grows at another exposure (s), None where

@@ -62,6 +62,7 @@ class Demultiplexer:
         camera: Camera | None = None,
         known: LabelledSpectra | None = None,
         threads: int = 1,
+        several: bool = True,
     ) -> None:
         """Factor a calibration.
 
@@ -74,6 +75,7 @@ class Demultiplexer:
             None: lenslets are demultiplexed one by one.
         known: spectra whose mean and covariance are the prior's; None: those of many surfaces.
         threads: for factoring the response.
+        several: whether many captures follow; for one, less is kept in memory.
 
         Raises UsageError where a method needs a camera that there is none of, ConfigError for one
             that tells no neighbours' light.
@@ -85,7 +87,8 @@ class Demultiplexer:
         self._displaced: dict[tuple[float, ...], NeighbourLight] = {}
         self.prior = light_prior(LensletResponses.of(calibration), known)
         # its superpixels, one for every lenslet, have served
-        self.responses = LensletResponses.of(replace(calibration, white=None), threads).prepare()
+        calibration = replace(calibration, white=None)
+        self.responses = LensletResponses.of(calibration, threads, several).prepare()
 
     def _neighbours(self, calibration: Calibration, camera: Camera | None) -> NeighbourLight | None:
         """Neighbours' light; a note where there is no telling and nobody insists."""

@@ -33,6 +33,7 @@ class LensletResponses:
     variance: (pixel, band) of its entries; None: unknown.
     origin: (lenslet_row, lenslet_column, 2), first pixels of the windows that F belongs to.
     threads: for factoring it.
+    several: whether many captures follow, for which dark levels are kept cut out.
     """
 
     calibration: Calibration
@@ -40,9 +41,12 @@ class LensletResponses:
     variance: np.ndarray | None
     origin: np.ndarray
     threads: int = 1
+    several: bool = True
 
     @classmethod
-    def of(cls, calibration: Calibration, threads: int = 1) -> LensletResponses:
+    def of(
+        cls, calibration: Calibration, threads: int = 1, several: bool = True
+    ) -> LensletResponses:
         """The responses as they were calibrated."""
         response = there(calibration.response)
         return cls(
@@ -51,6 +55,7 @@ class LensletResponses:
             variance=response.variance,
             origin=there(calibration.windows).origin,
             threads=threads,
+            several=several,
         )
 
     @property
@@ -131,13 +136,15 @@ class LensletResponses:
 
     @cached_property
     def levels(self) -> DarkWindows | None:
-        """Dark levels under the windows, None where they are black levels alone or some window
-        is not on the sensor.
+        """Dark levels under the windows, None where they are black levels alone, some window is
+        not on the sensor, or one capture alone would use them.
         """
         from plenocli.forward.sensor.readout import DarkWindows
         from plenocli.forward.sensor.superpixel import inside
 
-        if self.dark.flat or not inside(self.corners, self.window, self.dark.mean.shape).all():
+        if not self.several or self.dark.flat:
+            return None
+        if not inside(self.corners, self.window, self.dark.mean.shape).all():
             return None
         return DarkWindows(self.dark, self.corners, self.window).keep()
 

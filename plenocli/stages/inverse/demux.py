@@ -145,7 +145,12 @@ def run_demux(
         # a broken calibration ends the run here, before any capture
         job = (
             CaptureDemultiplexer(
-                calibration, settings, overwrite, command, min(workers, len(batch.todo))
+                calibration,
+                settings,
+                overwrite,
+                command,
+                threads=min(workers, len(batch.todo)),
+                several=len(batch.todo) > 1,
             )
             if batch.todo
             else None
@@ -288,6 +293,7 @@ class CaptureDemultiplexer:
     overwrite: whether results replace files.
     command: for their provenance.
     threads: for factoring the response.
+    several: whether many captures follow.
     """
 
     def __init__(
@@ -297,6 +303,7 @@ class CaptureDemultiplexer:
         overwrite: bool,
         command: str,
         threads: int = 1,
+        several: bool = True,
     ) -> None:
         from plenocli.files.artefacts.provenance import describe_inputs
         from plenocli.files.read.calibrations import read_described
@@ -319,6 +326,7 @@ class CaptureDemultiplexer:
             if settings.prior is None
             else read_labelled(settings.prior, there(found.response).wavelengths),
             threads=threads,
+            several=several or settings.reference is not None,
         )
         self.reference: Spectra | None = None
         if settings.reference is not None:

@@ -66,8 +66,8 @@ from plenocli.inverse.prior.natural_images import TrainingPicture, at_scales, sp
 from plenocli.inverse.sparse import dictionary as sparse
 from plenocli.inverse.sparse.dictionary import INCOHERENCE, PULL, Dictionary
 from plenocli.inverse.sparse.learning import advance, learner_for
+from plenocli.inverse.spectra.bands import stokes
 from plenocli.inverse.spectra.demultiplexer import Demultiplexer, method_of_white, tell_misfit
-from plenocli.inverse.spectra.polarisation import stokes
 from plenocli.inverse.spectra.spectra import Spectra
 
 __all__ = [

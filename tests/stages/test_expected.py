@@ -103,16 +103,12 @@ def drawn(folder, method, prior=None):
 
 
 def drawn_white(folder, method):
-    """The white reference demultiplexed."""
-    demux.run_demux(
-        [folder / "white.h5"],
-        folder / f"white-{method}.h5",
-        calibration=folder / "response.h5",
-        settings=demux.Settings(method=method, register="off"),
-        suffix=".h5",
-        overwrite=True,
-    )
-    return folder / f"white-{method}.h5"
+    """Radiances of the white reference as captures are divided by them."""
+    white = folder / "white.h5"
+    settings = demux.Settings(method=method, reference=white, register="off")
+    return demux.CaptureDemultiplexer(
+        folder / "response.h5", settings, overwrite=False, command=""
+    ).reference.value
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -128,7 +124,7 @@ def test_errors_and_separability_are_those_of_captures(dim, method):
     noise = np.sqrt(np.mean(found.var(axis=1, ddof=1), axis=0))
     np.testing.assert_allclose(said["noise_expected_per_band"], noise, rtol=0.15)
     own = {"lmmse": "wls"}.get(method, method)  # a reference is demultiplexed without a prior
-    white = read_artefact(drawn_white(dim, own), "spectra").data["spectra/value"][:, 2:-2, 2:-2]
+    white = drawn_white(dim, own)[:, 2:-2, 2:-2]
     ratio = white.mean(axis=(1, 2)) / white.std(axis=(1, 2), ddof=1)
     assert said["reference_snr_expected_db"] == pytest.approx(20 * np.log10(ratio.min()), abs=1)
     known = classes.Classes.of_spectra(("rust", "rust", "moss", "moss"), truth)

@@ -25,7 +25,7 @@ from plenocli.forward.scene.white_reference import REFERENCE_REFLECTANCE
     show_default=True,
     help=(
         "auto takes the one with the least predicted error and says so; coupled and fine solve "
-        "all lenslets together, with one value or 3x3 behind each."
+        "all lenslets together, with one value or several behind each."
     ),
 )
 @click.option(

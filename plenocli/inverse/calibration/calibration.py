@@ -160,6 +160,8 @@ class Response:
         degrees, than of light that is not polarised; None: it tells none apart.
     states: (band,) polarisation of the light of each band in degrees, NaN for light that is not
         polarised; None: of no band.
+    mixture: (measured band, band), of which columns in narrow bands those of matrix are made; None:
+        each of its own.
     energy: (band,), relative radiance of the source of each band, or None.
     quality: None where the file does not say it.
     notes: how it came about, as JSON ("source": "predicted" for one from a description).
@@ -170,6 +172,7 @@ class Response:
     wavelengths: np.ndarray
     polarised: np.ndarray | None = None
     states: np.ndarray | None = None
+    mixture: np.ndarray | None = None
     energy: np.ndarray | None = None
     quality: Quality | None = None
     notes: dict[str, Any] | None = None

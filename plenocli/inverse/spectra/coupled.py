@@ -2,7 +2,8 @@
 
 `coupled` has one radiance a lenslet and band, `fine` as many as the light tells apart of the points
 of its field, the answer being the points' mean: neighbours' light comes from their near edges,
-which differ from their means where edges lie inside fields. docs/model.md, section 9, "Neighbours".
+which differ from their means where edges lie inside fields, and `likeliest` says whether they do,
+down and across. docs/model.md, section 9, "Neighbours".
 """
 
 from __future__ import annotations
@@ -20,6 +21,10 @@ from plenocli.inverse.spectra.neighbours import NeighbourLight
 LEAST_CORRELATION = 0.05
 """Of lenslets beside each other, as the prior takes it."""
 MOST_CORRELATION = 0.98
+STEPPED = 0.99
+"""Of the covariance of points along an axis along which they change from lenslet to lenslet."""
+PART = 16
+"""Lenslets a side, at most, that are asked whether they do."""
 MOST = 2.0
 """Standard deviations by which neighbours' light is changed at most."""
 TURNS = 3
@@ -118,39 +123,86 @@ def coupled(capture: LatticeCapture, light: NeighbourLight, fit: bool = True) ->
     return _answer(system, capture, points, left, taken)
 
 
-def fine(capture: LatticeCapture, first: LatticeAnswer, light: NeighbourLight) -> LatticeAnswer:
+def fine(
+    capture: LatticeCapture,
+    first: LatticeAnswer,
+    light: NeighbourLight,
+    stepped: tuple[float, float],
+) -> LatticeAnswer:
     """What lies where in each field, band by band, with the prior that the first answer shows.
 
     first: by `coupled`.
     light: predicted, of the neighbours.
+    stepped: as PointPrior has it.
     """
-    blocks = light.fine(capture.response)
-    blocks = blocks.reshape(*blocks.shape[:2], -1)
-    variance, shape = _stationary(capture, first.value), first.value.shape[:2]
-    system = LatticeSystem(blocks, light.offsets, variance, shape, _prior(first))
-    even = light.modes.even[:, None] * first.value[:, :, None]
-    points, left = _solved(system, capture, even.reshape(*shape, -1))
+    prior = replace(_prior(first), stepped=stepped)
+    system = LatticeSystem(
+        _by_mode(capture, light),
+        light.offsets,
+        _stationary(capture, first.value),
+        first.value.shape[:2],
+        prior,
+    )
+    points, left = _solved(system, capture, _even_points(first.value, light))
     return _answer(system, capture, points, left, light)
 
 
-def more_likely(capture: LatticeCapture, first: LatticeAnswer, second: LatticeAnswer) -> bool:
-    """Whether the capture speaks for points in the fields, by the evidence of both models with the
-    same statistics of lenslets.
+def likeliest(
+    capture: LatticeCapture, first: LatticeAnswer, light: NeighbourLight
+) -> tuple[float, float]:
+    """Whether points change within fields (0) or from lenslet to lenslet (STEPPED), down and
+    across, by the evidence of the part of the array that changes most; STEPPED both ways is
+    the model of `coupled`.
 
-    first, second: by `coupled` and by `fine`.
+    first, light: as `fine` has them.
     """
-    points = second.system.prior
-    assert points is not None
-    lenslets = replace(points, modes=EVEN)
-    variance = _stationary(capture, first.value)
-    scale = np.sqrt(variance * max(1.0, second.misfit))
-    blocks = first.light.coupled(capture.response)
-    shape = first.value.shape[:2]
-    system = LatticeSystem(blocks, first.light.offsets, variance, shape, lenslets)
-    value, left = _solved(system, capture, first.value)
-    one = system.surprise(left, scale, value)
-    many = second.system.surprise(second.left, scale, second.points)
-    return many < one
+    part, prior = _liveliest(first.value), _prior(first)
+    values = capture.values
+    if capture.own is not None:
+        values = values - capture.own(first.value)
+    cut = replace(capture, values=values[part], start=capture.start[part], own=None)
+    value, variance = first.value[part], _stationary(capture, first.value)
+    shape, blocks, start = value.shape[:2], _by_mode(capture, light), _even_points(value, light)
+    tried: dict[tuple[float, float], tuple[LatticeSystem, np.ndarray, np.ndarray]] = {}
+    for stepped in ((0.0, 0.0), (STEPPED, 0.0), (0.0, STEPPED)):
+        alike = replace(prior, stepped=stepped)
+        system = LatticeSystem(blocks, light.offsets, variance, shape, alike)
+        tried[stepped] = (system, *_solved(system, cut, start))
+    each = first.light.coupled(capture.response)
+    alike = replace(prior, modes=EVEN)
+    system = LatticeSystem(each, first.light.offsets, variance, shape, alike)
+    tried[STEPPED, STEPPED] = (system, *_solved(system, cut, value))
+    system, points, left = tried[0.0, 0.0]
+    misfit = np.nanmedian(_residual(cut, system.mean(points), left))
+    scale = np.sqrt(variance * max(1.0, float(np.nan_to_num(misfit))))
+
+    def surprise(stepped: tuple[float, float]) -> float:
+        system, points, left = tried[stepped]
+        return system.surprise(left, scale, points)
+
+    return min(tried, key=surprise)
+
+
+def _by_mode(capture: LatticeCapture, light: NeighbourLight) -> np.ndarray:
+    """Blocks (block, pixel, mode * band) of the light."""
+    blocks = light.fine(capture.response)
+    return blocks.reshape(*blocks.shape[:2], -1)
+
+
+def _even_points(value: np.ndarray, light: NeighbourLight) -> np.ndarray:
+    """Unknowns of fields that are as bright everywhere as their mean."""
+    even = light.modes.even[:, None] * value[:, :, None]
+    return even.reshape(*value.shape[:2], -1)
+
+
+def _liveliest(value: np.ndarray) -> tuple[slice, slice]:
+    """Rows and columns of the PART lenslets a side that differ most from those beside them."""
+    power = np.zeros(value.shape[:2])
+    power[1:] += (np.diff(value, axis=0) ** 2).sum(axis=-1)
+    power[:, 1:] += (np.diff(value, axis=1) ** 2).sum(axis=-1)
+    starts = [sorted({*range(0, n - PART, PART), max(n - PART, 0)}) for n in value.shape[:2]]
+    parts = [(slice(r, r + PART), slice(c, c + PART)) for r in starts[0] for c in starts[1]]
+    return max(parts, key=lambda part: power[part].sum())
 
 
 def neighbour_part(answer: LatticeAnswer, response: np.ndarray) -> np.ndarray:
@@ -196,15 +248,11 @@ def _answer(
     left: np.ndarray,
     light: NeighbourLight,
 ) -> LatticeAnswer:
-    value, known = system.mean(points), capture.known
-    expected = capture.variance(value)
-    count = known.sum(axis=-1)
-    bands = value.shape[-1]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        freedom = np.where(count > bands, count - bands, np.nan)
-        residual = np.where(known, left**2 / expected, 0).sum(axis=-1) / freedom
-        # fewer pixels tell less
-        share = capture.response.shape[0] / np.where(count > bands, count, np.nan)
+    value = system.mean(points)
+    count, bands = capture.known.sum(axis=-1), value.shape[-1]
+    residual = _residual(capture, value, left)
+    # fewer pixels tell less
+    share = capture.response.shape[0] / np.where(count > bands, count, np.nan)
     power = _error_power(system, capture, value) * share[..., None]
     power *= max(1.0, float(np.nanmedian(residual)))
     taken_off = np.nan_to_num(value - capture.start)
@@ -219,6 +267,15 @@ def _answer(
         system=system,
         light=light,
     )
+
+
+def _residual(capture: LatticeCapture, value: np.ndarray, left: np.ndarray) -> np.ndarray:
+    """Mean square (lenslet_row, lenslet_column) of what is left over the expected one."""
+    known = capture.known
+    count, bands = known.sum(axis=-1), value.shape[-1]
+    freedom = np.where(count > bands, count - bands, np.nan)
+    expected = capture.variance(value)
+    return np.asarray(np.where(known, left**2 / expected, 0).sum(axis=-1) / freedom)
 
 
 def _error_power(system: LatticeSystem, capture: LatticeCapture, value: np.ndarray) -> np.ndarray:

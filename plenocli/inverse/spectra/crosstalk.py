@@ -17,7 +17,7 @@ from plenocli.inverse.spectra.coupled import (
     LatticeCapture,
     coupled,
     fine,
-    more_likely,
+    likeliest,
     neighbour_part,
     shift_step,
 )
@@ -97,14 +97,13 @@ class Crosstalk:
     def spectra(self, method: str) -> Spectra:
         """By "coupled", "fine" or the best of all, "auto"."""
         # fine makes patterns of a field of what is wrong with F, most where it is predicted
-        if method == "coupled" or (method == "auto" and self.c.predicted):
-            name, answer = "coupled", self.first
-        else:
-            name, answer = "fine", fine(self.capture, self.first, self.light)
+        name, answer = "coupled", self.first
+        if method == "fine" or (method == "auto" and not self.c.predicted):
+            stepped = likeliest(self.capture, self.first, self.light)
+            if method == "fine" or not all(stepped):
+                name, answer = "fine", fine(self.capture, self.first, self.light, stepped)
         if method in METHODS:
             return self._told(answer, method, method, "asked for")
-        if name == "fine" and not more_likely(self.capture, self.first, answer):
-            name, answer = "coupled", self.first
         error = {name: float(np.nanmean(answer.sigma[self.c.valid] ** 2))}
         biases = {}
         # wls and lmmse lean on dark pixels, where neighbours' light lies: pinv in all of 40 cases

@@ -12,6 +12,7 @@ import numpy as np
 from plenocli.base.errors import ConfigError, NumericsError, UsageError
 from plenocli.base.progress import note
 from plenocli.inverse.registration.alignment import align, believed, doubtful, misfit_told
+from plenocli.inverse.spectra.bands import by_filter, by_state
 from plenocli.inverse.spectra.crosstalk import METHODS as NEIGHBOURLY
 from plenocli.inverse.spectra.crosstalk import (
     Crosstalk,
@@ -20,7 +21,6 @@ from plenocli.inverse.spectra.crosstalk import (
     sensor_of,
     windows_of,
 )
-from plenocli.inverse.spectra.polarisation import by_state
 from plenocli.inverse.spectra.radiance import estimate, light_prior, readout
 from plenocli.inverse.spectra.responses import LensletResponses
 
@@ -81,6 +81,8 @@ class Demultiplexer:
             that tells no neighbours' light.
         """
         calibration = by_state(calibration)
+        if ratio:
+            calibration = by_filter(calibration, camera)
         self.method, self.register, self.ratio = method, register, ratio
         self.neighbours = self._neighbours(calibration, camera)
         self.moving = _moving(calibration, self.neighbours)
@@ -122,7 +124,7 @@ class Demultiplexer:
         path: of the capture, for messages.
         method: instead of the usual one.
 
-        Returns Spectra whose bands may come in two states (plenocli.inverse.spectra.polarisation).
+        Returns Spectra whose bands may come in two states (plenocli.inverse.spectra.bands).
         Raises InputError where capture and calibration do not go together, NumericsError where no
         lenslet can be demultiplexed.
         """

@@ -43,18 +43,21 @@ light hardly tells apart.
 @dataclass(frozen=True, kw_only=True)
 class PointPrior:
     """Values of object points that are alike where they are near: normal, of mean `mean` and
-    covariance C rho^(fields apart down + across).
+    covariance C rho^(fields apart down + across), or C rho^(lenslets apart) where they change from
+    lenslet to lenslet alone.
 
     mean: (band,).
     inverse: (band, band), of C.
     rho: correlation of points a field apart.
     modes: of a field, which are known of them.
+    stepped: share of the covariance down and across that is even within fields.
     """
 
     mean: np.ndarray
     inverse: np.ndarray
     rho: float
     modes: FieldModes = EVEN
+    stepped: tuple[float, float] = (0.0, 0.0)
 
     @property
     def even(self) -> np.ndarray:
@@ -64,26 +67,36 @@ class PointPrior:
     @property
     def spread(self) -> np.ndarray:
         """Standard deviations of the unknowns (mode * band,)."""
-        axis = np.diagonal(self._near())
-        modes = np.prod(axis[self.modes.kept], axis=1)
+        near, even = np.diagonal(self._near()), self._level**2
+        axes = [near + share * (even - near) for share in self.stepped]
+        modes = axes[0][self.modes.kept[:, 0]] * axes[1][self.modes.kept[:, 1]]
         return np.sqrt(np.outer(modes, np.diagonal(np.linalg.inv(self.inverse)))).ravel()
 
     def precision(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
         """Inverse covariance of modes at frequencies (n,) and (m,), radians a lenslet, all bands
         alike: (n, m, mode, mode) complex.
         """
-        down, across = (self._axis(one) for one in (rows, columns))
+        down, across = map(self._axis, (rows, columns), self.stepped)
         first, second = (np.ix_(one, one) for one in self.modes.kept.T)
         covariance = down[:, None, *first] * across[None, :, *second]
         return np.linalg.inv(covariance)
 
-    def _axis(self, frequency: np.ndarray) -> np.ndarray:
+    @property
+    def _level(self) -> np.ndarray:
+        """Amounts of patterns along an axis (pattern,) where all points are 1."""
+        return np.asarray(self.modes.weights.sum(axis=1))
+
+    def _axis(self, frequency: np.ndarray, stepped: float) -> np.ndarray:
         """Covariance of patterns along one axis at frequencies (n,): (n, pattern, pattern)."""
         place = np.arange(self.modes.points) / self.modes.points
         before = self.modes.weights @ self._alike(1 + place[:, None] - place) @ self.modes.weights.T
         turn = np.exp(-1j * frequency)[:, None, None]
         out = before * turn / (1 - self.rho * turn)
-        return self._near() + out + out.conj().swapaxes(1, 2)
+        within = self._near() + out + out.conj().swapaxes(1, 2)
+        chain = (1 - self.rho**2) / np.abs(1 - self.rho * turn) ** 2
+        return np.asarray(
+            (1 - stepped) * within + stepped * chain * np.outer(self._level, self._level)
+        )
 
     def _near(self) -> np.ndarray:
         """Covariance of patterns along an axis of one field."""

@@ -15,6 +15,7 @@ from plenocli.base.progress import note
 from plenocli.forward.camera.geometry import finely_sampled, geometry
 from plenocli.forward.camera.pupil import polarised
 from plenocli.forward.propagation.response import uniform_response, valid_for
+from plenocli.inverse.calibration.calibration import there
 from plenocli.inverse.registration.smooth_response import DEGREE
 from plenocli.inverse.spectra.field_modes import FieldModes, field_modes
 
@@ -198,7 +199,7 @@ def _as_measured(camera: Camera, calibration: Calibration) -> Camera:
 
     if valid_for(camera, "fresnel"):
         return camera
-    measured, colours = _typical(calibration), _colours(camera, calibration)
+    measured, colours = _in_narrow_bands(calibration), _colours(camera, calibration)
     colours = np.where(np.isfinite(measured), colours, 0)
     measured = np.nan_to_num(measured)
 
@@ -223,7 +224,7 @@ def _predicted(
     """
     from plenocli.forward.propagation.system_matrix import PifBuilder
 
-    measured, bands = _typical(calibration), []
+    measured, bands = _in_narrow_bands(calibration), []
     offsets = np.zeros((0, 2), int)
     for wavelength, sampled, plan in _planned(camera, calibration):
         builder = PifBuilder(sampled, wavelength, plan)
@@ -234,7 +235,7 @@ def _predicted(
     even = np.ones(POINTS**2) if modes is None else modes.even
     known = np.einsum("opmk,m,pk->k", light, even, np.isfinite(measured))
     light *= np.nansum(measured, axis=0) / np.maximum(known, 1e-300)
-    return offsets, light
+    return offsets, _mixed(light, calibration)
 
 
 def _planned(camera: Camera, calibration: Calibration) -> Iterator[tuple[float, Camera, PifPlan]]:
@@ -251,8 +252,6 @@ def _planned(camera: Camera, calibration: Calibration) -> Iterator[tuple[float, 
 
 def _by_band(camera: Camera, calibration: Calibration) -> list[tuple[float, Camera]]:
     """The wavelength (m) of each band of the response, and the camera in its light."""
-    from plenocli.inverse.calibration.calibration import there
-
     response = there(calibration.response)
     states = np.full(len(response.wavelengths), np.nan)
     states = states if response.states is None else response.states
@@ -293,12 +292,11 @@ class MovingResponse:
 
     def __init__(self, camera: Camera, calibration: Calibration) -> None:
         """Predict the response where it is."""
-        from plenocli.inverse.calibration.calibration import there
-
         why = valid_for(camera, "fresnel")
         if why is not None or calibration.sensor.cfa != "mono":
             raise ConfigError(why or "a colour filter array", "camera", "leave it to splines")
-        self.measured, self.bands = _typical(calibration), _by_band(camera, calibration)
+        self.calibration, self.bands = calibration, _by_band(camera, calibration)
+        self.measured = _in_narrow_bands(calibration)
         here = _even(self.bands, np.zeros(2))
         self.scale = np.nansum(self.measured, axis=0) / here.sum(axis=0)
         self.here = here * self.scale
@@ -308,13 +306,15 @@ class MovingResponse:
         """F (pixel, band) with the light displaced by (rows, columns) px: what the closed form has
         wrong goes with it.
         """
-        return _even(self.bands, displacement) * self.scale + self._wrong(displacement)
+        found = _even(self.bands, displacement) * self.scale + self._wrong(displacement)
+        return _mixed(found, self.calibration)
 
     def variance(self, displacement: np.ndarray) -> np.ndarray:
         """Of `at`, (pixel, band): half of what makes the difference if the wrong stays."""
         from scipy.ndimage import uniform_filter
 
-        apart = (self._wrong(displacement) - self._wrong(np.zeros(2))) ** 2
+        apart = self._wrong(displacement) - self._wrong(np.zeros(2))
+        apart = _mixed(apart, self.calibration) ** 2
         near = uniform_filter(apart.reshape(*self.window, -1), (3, 3, 0))
         return np.asarray(near.reshape(apart.shape) / 2)
 
@@ -336,7 +336,6 @@ class MovingResponse:
 
 def _typical(calibration: Calibration) -> np.ndarray:
     """F (pixel, band) of all lenslets, or the mean of their own ones."""
-    from plenocli.inverse.calibration.calibration import there
     from plenocli.inverse.calibration.quality import mean_of_known
 
     matrix = there(calibration.response).matrix
@@ -345,10 +344,21 @@ def _typical(calibration: Calibration) -> np.ndarray:
     )
 
 
+def _in_narrow_bands(calibration: Calibration) -> np.ndarray:
+    """`_typical` as it was measured, before its columns were mixed."""
+    mixture = there(calibration.response).mixture
+    typical = _typical(calibration)
+    return typical if mixture is None else typical @ np.linalg.inv(mixture)
+
+
+def _mixed(columns: np.ndarray, calibration: Calibration) -> np.ndarray:
+    """Of light of narrow bands (..., band), as the calibration's response is."""
+    mixture = there(calibration.response).mixture
+    return columns if mixture is None else columns @ mixture.astype(columns.dtype)
+
+
 def _check(camera: Camera, calibration: Calibration) -> None:
     """ConfigError where the lenslets cannot be predicted."""
-    from plenocli.inverse.calibration.calibration import there
-
     windows, grid = there(calibration.windows), calibration.grid
     optics = [geometry(camera, w) for w in there(calibration.response).wavelengths]
     spread = max(1 + one.blur / one.D2 for one in optics)
@@ -392,7 +402,6 @@ def _by_part(matrix: np.ndarray, camera: Camera) -> np.ndarray:
 def _colours(camera: Camera, calibration: Calibration) -> np.ndarray:
     """Efficiency (pixel, band) of the pixels under their colours."""
     from plenocli.forward.sensor.cfa import cfa_map, sensitivity
-    from plenocli.inverse.calibration.calibration import there
 
     windows = there(calibration.windows)
     letters, efficiency = sensitivity(camera, there(calibration.response).wavelengths)

@@ -15,7 +15,7 @@ import numpy as np
 from plenocli.base.errors import InputError, NumericsError
 from plenocli.forward.sensor.noise import Noise
 from plenocli.inverse.calibration.calibration import there
-from plenocli.inverse.spectra.polarisation import with_polarisation
+from plenocli.inverse.spectra.bands import with_polarisation
 from plenocli.inverse.spectra.spectra import Spectra, Trace
 
 if TYPE_CHECKING:
@@ -29,8 +29,6 @@ WORTHWHILE = 1.05
 """`auto` takes a method that assumes more only where it predicts a mean square error this much
 smaller.
 """
-LIT = 1024
-"""Lenslets whose white tells the light."""
 BATCH_NUMBERS = 4_000_000
 """Pixels of lenslets that are held at a time."""
 Prior = tuple[np.ndarray, np.ndarray]
@@ -110,17 +108,9 @@ def light_prior(c: LensletResponses, known: LabelledSpectra | None = None) -> Pr
     """
     from plenocli.forward.scene.statistics import radiance_statistics, reflectance_statistics
     from plenocli.forward.scene.tables import surfaces
-    from plenocli.inverse.spectra.demultiplex import demultiplex
 
-    white = there(there(c.calibration.white).superpixels)
-    some = tuple(part[:: max(1, len(part) // LIT)] for part in c.sites)
-    response = c.at(some)
-    if not c.shared:
-        white = white[some]
-    light: np.ndarray = demultiplex(response, white, "pinv")[0].reshape(-1, len(c.wavelengths))
-    light = light[np.isfinite(light).all(axis=1)]
-    light = np.median(light, axis=0) if len(light) else np.zeros(1)
-    if not (light > 0).all():
+    light = c.white_light
+    if light is None:
         return None
     mean, covariance = reflectance_statistics(
         surfaces(c.wavelengths) if known is None else known.at(c.wavelengths)

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from plenocli.inverse.registration.reference import Reference
     from plenocli.inverse.spectra.factored import FactoredResponses
 
+LIT = 1024
+"""Lenslets whose white tells the light."""
 SAMPLE = 256
 """Lenslets on which methods are compared."""
 BATCH_NUMBERS = 4_000_000
@@ -193,6 +195,21 @@ class LensletResponses:
     def sampled_pixels(self) -> tuple[np.ndarray, np.ndarray]:
         """`pixels` of the sample."""
         return self.pixels(self.sample)
+
+    @property
+    def white_light(self) -> np.ndarray | None:
+        """Radiance (band,) of the calibration's white, None where it has no light in some band."""
+        from plenocli.inverse.spectra.demultiplex import demultiplex
+
+        white = there(there(self.calibration.white).superpixels)
+        some = tuple(part[:: max(1, len(part) // LIT)] for part in self.sites)
+        if not self.shared:
+            white = white[some]
+        light: np.ndarray = demultiplex(self.at(some), white, "pinv")[0]
+        light = light.reshape(-1, len(self.wavelengths))
+        light = light[np.isfinite(light).all(axis=1)]
+        light = np.median(light, axis=0) if len(light) else np.zeros(1)
+        return light if (light > 0).all() else None
 
     def pixels(self, which: np.ndarray | slice) -> tuple[np.ndarray, np.ndarray]:
         """What single-pixel extraction takes.

@@ -48,6 +48,7 @@ def run_expected(
     from plenocli.forward.scene.light import broadband
     from plenocli.forward.scene.tables import illuminant
     from plenocli.inverse.calibration.calibration import there
+    from plenocli.inverse.spectra.bands import by_filter
     from plenocli.inverse.spectra.radiance import light_prior
     from plenocli.inverse.spectra.responses import LensletResponses
 
@@ -61,6 +62,7 @@ def run_expected(
             path,
             "make one with simulate-response",
         )
+    found = by_filter(found, camera)
     known = read_labelled(classes, bands)
     light = broadband(camera, lambda w: illuminant(camera.light.illuminant, w))
     optics, matrix = _optics(found, camera, light)

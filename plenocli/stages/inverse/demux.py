@@ -20,8 +20,8 @@ from plenocli.execution.pool import absolute, open_pool
 from plenocli.files.images.mosaic import read_capture
 from plenocli.files.read.captures import describe_capture, named_captures
 from plenocli.forward.scene.white_reference import REFERENCE_REFLECTANCE
+from plenocli.inverse.spectra.bands import stokes
 from plenocli.inverse.spectra.demultiplexer import Demultiplexer, method_of_white, tell_misfit
-from plenocli.inverse.spectra.polarisation import stokes
 
 if TYPE_CHECKING:
     from plenocli.execution.batch import Batch, BatchSummary

@@ -5,7 +5,7 @@ import pytest
 
 from plenocli.forward.sensor.noise import Noise
 from plenocli.inverse.spectra import lattice_system
-from plenocli.inverse.spectra.coupled import LatticeCapture, coupled, fine, more_likely
+from plenocli.inverse.spectra.coupled import PART, STEPPED, LatticeCapture, coupled, fine, likeliest
 from plenocli.inverse.spectra.field_modes import FieldModes, field_modes
 from plenocli.inverse.spectra.lattice_system import UNTOLD, LatticeSystem, PointPrior
 from plenocli.inverse.spectra.neighbours import NeighbourLight
@@ -195,6 +195,25 @@ def test_the_prior_is_an_exponential_correlation_of_points():
         np.testing.assert_allclose(covariance[place], expected, rtol=2e-3)
 
 
+def test_what_steps_at_borders_is_even_within_fields_and_alike_beyond():
+    """Along an axis of lenslets; across it points go on changing."""
+    r = 0.4
+    prior = PointPrior(
+        mean=np.zeros(1), inverse=np.array([[1.0]]), rho=r, modes=ALL, stepped=(0.9, 0.0)
+    )
+    frequency = 2 * np.pi * np.fft.fftfreq(16)
+    precision = prior.precision(frequency, frequency)
+    covariance = np.fft.ifft2(np.linalg.inv(precision), axes=(0, 1)).real
+    for lenslets in (0, 1, 2):
+        for first, second in np.ndindex(POINTS, POINTS):
+            down = covariance[lenslets, 0, first * POINTS, second * POINTS]
+            apart = abs(lenslets + (first - second) / POINTS)
+            assert down == pytest.approx(0.9 * r**lenslets + 0.1 * r**apart, rel=1e-3)
+            across = covariance[0, lenslets, first, second]
+            assert across == pytest.approx(r**apart, rel=1e-3)
+    np.testing.assert_allclose(prior.spread, 1)
+
+
 def edge_lit(side=9, pixels=12):
     """Light (superpixel, pixel, point, band) of which a rim of the field goes to the neighbour."""
     y, x = (np.indices((side, side)).reshape(2, -1) + 0.5) / side
@@ -280,24 +299,48 @@ def test_the_size_of_neighbours_light_is_fitted(strength):
     assert total == pytest.approx(real.light[assumed.own != np.arange(9)].sum(), rel=0.05)
 
 
-def test_edges_inside_fields_are_told_by_points_and_by_the_evidence():
-    light, rng = lattice_light(2.0), np.random.default_rng(8)
-    patches = rng.uniform(0.05, 0.9, (9, 9, BANDS))
-    r, c = ((np.arange(24 * POINTS) + 4) // 8 for _ in range(2))
-    picture = patches[r % 9][:, c % 9].reshape(24, POINTS, 24, POINTS, BANDS).swapaxes(1, 2)
-    for truth, edges in (
-        (picture.reshape(24, 24, -1, BANDS), True),
-        (each_its_own((24, 24)), False),
+def squares(down, across, lenslets=24, seed=8):
+    """Patches of 8 points a side, their edges by so many points off the lenslets' borders:
+    (rows, columns, point, band).
+    """
+    patches = np.random.default_rng(seed).uniform(0.05, 0.9, (9, 9, BANDS))
+    r, c = ((np.arange(lenslets * POINTS) + off) // size for off, size in (down, across))
+    picture = patches[r % 9][:, c % 9].reshape(lenslets, POINTS, lenslets, POINTS, BANDS)
+    return picture.swapaxes(1, 2).reshape(lenslets, lenslets, -1, BANDS)
+
+
+@pytest.mark.parametrize("down", [(4, 8), (0, 6)])
+@pytest.mark.parametrize("across", [(4, 8), (0, 6)])
+def test_edges_inside_fields_are_told_by_points_and_by_the_evidence(down, across):
+    """Down, across, both or neither."""
+    light, truth = lattice_light(2.0), squares(down, across)
+    shot = capture(light, truth)
+    one = coupled(shot, light)
+    found = likeliest(shot, one, light)
+    assert found == tuple(STEPPED * (off == 0) for off, _ in (down, across))
+    errors = {}
+    for stepped in ((0.0, 0.0), (STEPPED, 0.0), (0.0, STEPPED), (STEPPED, STEPPED)):
+        many = fine(shot, one, light, stepped)
+        errors[stepped] = np.sqrt(((many.value - truth.mean(axis=2)) ** 2).mean())
+        if stepped == found:
+            z = (many.value - truth.mean(axis=2)) / many.sigma
+            assert 0.6 < np.sqrt((z**2).mean()) < 1.3
+    assert errors[found] < 1.02 * min(errors.values())
+    assert errors[found] < 0.9 * errors[0.0, 0.0] or found == (0, 0)
+    alone = np.sqrt(((one.value - truth.mean(axis=2)) ** 2).mean())
+    assert errors[found] < (1.05 if all(found) else 0.9) * alone
+
+
+def test_the_part_that_is_asked_is_where_lenslets_differ():
+    """An even array with edges inside fields in one corner, and one of lenslets of their own."""
+    light, truth = lattice_light(2.0), np.full((40, 36, POINTS**2, BANDS), 0.4)
+    for corner, stepped in (
+        (squares((4, 8), (4, 8), PART), 0.0),
+        (each_its_own((PART, PART)), STEPPED),
     ):
+        truth[-PART:, -PART:] = corner
         shot = capture(light, truth)
-        one = coupled(shot, light)
-        many = fine(shot, one, light)
-        mean = truth.mean(axis=2)
-        errors = [np.sqrt(((found.value - mean) ** 2).mean()) for found in (one, many)]
-        assert more_likely(shot, one, many) == edges, errors
-        assert (errors[1] < errors[0]) == edges, errors
-        z = (many.value - mean) / many.sigma
-        assert 0.5 < np.sqrt((z**2).mean()) < 1.5
+        assert likeliest(shot, coupled(shot, light), light) == (stepped, stepped)
 
 
 def test_lost_pixels_take_nothing_from_the_others():

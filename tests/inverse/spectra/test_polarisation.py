@@ -15,8 +15,8 @@ from plenocli.forward.scene.scenes import Polarised, Uniform
 from plenocli.forward.scene.white_reference import REFERENCE_REFLECTANCE
 from plenocli.forward.sensor.exposure import ExposureOptions, StoredMatrix, simulate_capture
 from plenocli.inverse.calibration.measure import NarrowBands, calibrate
+from plenocli.inverse.spectra.bands import by_state, stokes
 from plenocli.inverse.spectra.demultiplexer import Demultiplexer
-from plenocli.inverse.spectra.polarisation import by_state, stokes
 
 SAMPLES = Path(__file__).resolve().parents[3] / "sample_configs"
 COUNT = (8, 9)

@@ -1,6 +1,9 @@
-"""Bands in two states of polarisation: a response that tells them apart has a column for each, and
-what is found of the two makes the Stokes parameters s0 (all light) and s1 (along 0 degrees less
-along 90). docs/model.md, section 9, "Polarisation".
+"""Bands that are solved for, from those that were calibrated. In two states of polarisation: a
+response that tells them apart has a column for each, and what is found of the two makes the Stokes
+parameters s0 (all light) and s1 (along 0 degrees less along 90). As filters see them: a response is
+calibrated in light of one wavelength a band, of which overlapping filters pass some each; solved
+for such light, bands come out sharper than any filter. docs/model.md, section 9, "Polarisation" and
+"Overlapping filters".
 """
 
 from __future__ import annotations
@@ -10,9 +13,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from plenocli.forward.camera.pupil import filter_cells, filter_transmittance
 from plenocli.inverse.calibration.calibration import there
+from plenocli.inverse.calibration.quality import mean_of_known
+from plenocli.inverse.spectra.responses import LensletResponses
 
 if TYPE_CHECKING:
+    from plenocli.forward.camera.model import Camera
     from plenocli.inverse.calibration.calibration import Calibration, Response
     from plenocli.inverse.spectra.spectra import Spectra
 
@@ -20,6 +27,10 @@ LEAST_ANGLE = 2.0
 """Degrees between the responses to both states, below which a band is one of all light."""
 SPREAD = 0.3
 """Standard deviation of degrees of polarisation, as far as a prior knows."""
+LEAST_OVERLAP = 1e-5
+"""Of a filter's light, from another band's wavelength, below which it counts as blocked."""
+MOST_ALIKE = 100.0
+"""Condition of the filters at the bands' wavelengths from which they are not told apart."""
 
 
 def by_state(calibration: Calibration) -> Calibration:
@@ -107,3 +118,67 @@ def with_polarisation(covariance: np.ndarray, mean: np.ndarray, states: np.ndarr
     """
     sign = np.where(np.isnan(states), 0.0, np.where(states == 0, 1.0, -1.0))
     return covariance + SPREAD**2 * np.outer(sign, sign) * (covariance + np.outer(mean, mean))
+
+
+def by_filter(calibration: Calibration, camera: Camera | None) -> Calibration:
+    """The calibration with a column for the light of each filter instead of each wavelength, a
+    white as bright as before; as it is where filters do not overlap, or bands are not theirs.
+
+    camera: its description.
+    """
+    response = there(calibration.response)
+    if camera is None or response.states is not None or response.polarised is not None:
+        return calibration
+    passed = _passed(camera, response.wavelengths)
+    if passed is None:
+        return calibration
+    lit = [
+        sum(
+            (y1 - y0) * (x1 - x0) * t
+            for (y0, y1, x0, x1), t in filter_cells(camera, float(w)) or ()
+        )
+        for w in response.wavelengths
+    ]
+    f = response.matrix
+    column = f if response.shared else mean_of_known(f[calibration.grid.valid])
+    light = LensletResponses.of(calibration).white_light
+    if light is None or not min(lit) > 0:
+        return calibration
+    # what comes through a filter at the wavelength of each band, where lamps differ
+    amount = passed * np.nansum(column, axis=0) / lit
+    amount *= (light / (amount @ light))[:, None]
+    shares = amount * light / light[:, None]
+    others = shares - np.diag(np.diagonal(shares))
+    if others.max() < LEAST_OVERLAP or np.linalg.cond(shares) > MOST_ALIKE:
+        return calibration
+    mixture = np.linalg.inv(amount)
+    variance = None if response.variance is None else response.variance @ mixture**2
+    return replace(
+        calibration,
+        response=replace(
+            response,
+            matrix=f @ mixture.astype(f.dtype),
+            variance=variance,
+            mixture=mixture,
+            energy=None,
+            quality=None,
+        ),
+    )
+
+
+def _passed(camera: Camera, bands: np.ndarray) -> np.ndarray | None:
+    """Transmittance (filter, band) of the one filter of each band at the bands' wavelengths; None
+    where filters are not those of bands.
+    """
+    filters = () if camera.filter_array is None else camera.filter_array.filters
+    middles = np.array([np.nan if one.middle is None else one.middle for one in filters])
+    if len(filters) != len(bands) or not np.isfinite(middles).all():
+        return None
+    own = [filters[k] for k in np.argsort(middles)]
+    order = np.argsort(bands)
+    if any(abs(f.middle - bands[k]) > f.width for f, k in zip(own, order)):
+        return None
+    out = np.empty((len(bands), len(bands)))
+    for one, k in zip(own, order):
+        out[k] = [filter_transmittance(one, float(w)) for w in bands]
+    return out

@@ -82,7 +82,12 @@ def test_a_refusal_keeps_its_exit_code_where_nobody_reads_it(folder, redirected)
 
 # --- names ----------------------------------------------------------------------------------------
 
-NAMES = {"latin-1": b"caf\xe9", "escape": b"a\x1b[31mb\x1b]0;owned\x07c", "line": b"a\nb"}
+NAMES = {
+    "latin-1": b"caf\xe9",
+    "escape": b"a\x1b[31mb\x1b]0;owned\x07c",
+    "line": b"a\nb",
+    "all": b"caf\xe9\x1b[31mb\x1b]0;owned\x07c\nb",
+}
 USES = {
     "simulate-pif camera.toml -o X.h5": "camera.toml",
     "capture-sim camera.toml --pif pif.h5 --scene photo.png -o X.h5": "photo.png",
@@ -103,7 +108,13 @@ USES = {
 }
 
 
-@pytest.mark.parametrize("name", NAMES.values(), ids=NAMES)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, id=what, marks=() if what == "all" else pytest.mark.slow)
+        for what, name in NAMES.items()
+    ],
+)
 @pytest.mark.parametrize("command, given", USES.items(), ids=[c.split(" -")[0] for c in USES])
 def test_any_name_works_and_reaches_terminal_and_files_as_text(
     runner, folder, command, given, name

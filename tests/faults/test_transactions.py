@@ -60,7 +60,7 @@ def test_of_a_failure_all_results_stay_as_they_were(runner, folder, campaign, co
     whole = _results(folder)
     assert len(whole) >= 2
     for had, places in campaign(
-        ((True, (1, 4)), (False, (2, 8))), ((True, range(1, 200)), (False, range(1, 200)))
+        ((True, (4,)), (False, (2,))), ((True, range(1, 200)), (False, range(1, 200)))
     ):
         old = dict.fromkeys(whole, OLD) if had else {}
         for nth in places:

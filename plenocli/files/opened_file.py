@@ -41,7 +41,7 @@ def open_file(file: Path | str) -> OpenedFile:
     from plenocli.files.artefacts.container import opened_artefact
     from plenocli.files.artefacts.provenance import require_file
     from plenocli.files.artefacts.shards import PIF_KINDS, read_pif
-    from plenocli.files.images.exr import read_exr
+    from plenocli.files.images.exr import read_header
     from plenocli.files.images.mosaic import CAPTURE, is_hdf5
     from plenocli.files.images.pictures import file_type
     from plenocli.files.images.spectral_exr import is_spectral
@@ -57,6 +57,6 @@ def open_file(file: Path | str) -> OpenedFile:
     kind = "capture"
     if file_type(path) == "exr" and is_spectral(path):
         kind = "spectra"
-    elif file_type(path) == "exr" and CAPTURE not in read_exr(path)[1]:
+    elif file_type(path) == "exr" and CAPTURE not in read_header(path).attrs:
         kind = "image"
     return OpenedFile(path=path, kind=kind, artefact=None)

@@ -11,7 +11,7 @@ import pytest
 
 from plenocli.base.budget import Budget, within
 from plenocli.base.errors import InputError, NumericsError, OutputError, UsageError
-from plenocli.files.images.exr import read_exr, write_exr
+from plenocli.files.images.exr import read_exr, read_header, stored_channel, write_exr
 from plenocli.files.images.pictures import read_picture
 from plenocli.files.images.spectral_exr import (
     is_spectral,
@@ -120,6 +120,25 @@ def test_header_that_declares_too_much_is_refused_before_reading(tmp_path):
         read_exr(tmp_path / "x.exr")
     with pytest.raises(InputError, match="more than 1e\\+06|more than 977KiB"):
         read_exr(tmp_path / "x.exr", most=1_000_000)
+
+
+def test_lines_of_a_channel_that_stays_in_its_file_are_those_of_the_whole(tmp_path):
+    values = np.random.default_rng(8).random((70, 31)).astype(np.float32)
+    write_exr(tmp_path / "x.exr", {"Y": values, "Z": -values}, {"k": "v"})
+    header = read_header(tmp_path / "x.exr")
+    assert (header.names, header.shape, header.by_lines) == (["Y", "Z"], (70, 31), True)
+    assert header.attrs == read_exr(tmp_path / "x.exr")[1]
+    plane = stored_channel(tmp_path / "x.exr", header, "Z")
+    for rows, columns in ((slice(0, 70), slice(None)), (slice(15, 17), slice(3, 30))):
+        np.testing.assert_array_equal(plane.read(rows, columns), -values[rows, columns])
+    with within(Budget(8 * 31 * 4)):
+        plane.read(slice(5, 9), slice(None))
+        with pytest.raises(NumericsError, match="to be read"):
+            plane.read(slice(5, 10), slice(None))
+    good = (tmp_path / "x.exr").read_bytes()
+    (tmp_path / "x.exr").write_bytes(good[:-40])
+    with pytest.raises(InputError):
+        read_header(tmp_path / "x.exr")
 
 
 def test_missing_empty_foreign_and_folder(tmp_path):

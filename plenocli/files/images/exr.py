@@ -11,6 +11,7 @@ import contextlib
 import os
 import re
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from plenocli.base.budget import budget
 from plenocli.base.errors import InputError, OutputError
 from plenocli.base.memory import size_text
 from plenocli.base.text import printable, utf8
+from plenocli.base.tiling import Plane
 from plenocli.files.artefacts.provenance import first_bytes
 from plenocli.files.atomic import check_output, replacement
 from plenocli.files.outside import outside
@@ -105,7 +107,7 @@ def _channels(path: str, most: int | None) -> tuple[dict[str, np.ndarray], dict[
         pixels = source.read_image("float")
         if pixels is None:
             raise InputError(f"is damaged: {oiio_error(source)}", path, "make or copy it again")
-        attrs = {a.name: a.value for a in spec.extra_attribs if isinstance(a.value, str)}
+        attrs = _texts(spec)
         pixels = np.asarray(pixels, dtype=np.float32).reshape(
             spec.height, spec.width, spec.nchannels
         )
@@ -115,6 +117,68 @@ def _channels(path: str, most: int | None) -> tuple[dict[str, np.ndarray], dict[
             name: np.ascontiguousarray(pixels[..., i]) for i, name in enumerate(spec.channelnames)
         }
     return channels, attrs
+
+
+@dataclass(frozen=True, kw_only=True)
+class Header:
+    """What an EXR says before its pixels.
+
+    names: of the channels.
+    attrs: name -> text.
+    shape: (rows, columns).
+    by_lines: whether lines follow each other, and can be read without the others.
+    """
+
+    names: list[str]
+    attrs: dict[str, str]
+    shape: tuple[int, int]
+    by_lines: bool
+
+
+def read_header(path: Name) -> Header:
+    """The header alone, of a file of ours verified.
+
+    Raises InputError as read_exr.
+    """
+    require_seal(path)
+    found = outside(_header, path)
+    return Header(**found | {"shape": tuple(found["shape"])})
+
+
+def _header(path: str) -> dict[str, Any]:
+    """As read_header; runs outside."""
+    with _opened(path) as source:
+        spec = source.spec()
+        _check_kind(path, source, spec)
+        names, attrs = list(spec.channelnames), _texts(spec)
+        "".join([*names, *attrs, *attrs.values()]).encode()
+        shape = [spec.height, spec.width]
+        return {"names": names, "attrs": attrs, "shape": shape, "by_lines": not spec.tile_width}
+
+
+def stored_channel(path: Name, header: Header, name: str) -> Plane:
+    """A channel whose values stay in the file, by the Header of one `by_lines`; windows of it raise
+    InputError.
+    """
+
+    def window(rows: slice, columns: slice) -> np.ndarray:
+        first, last, _ = rows.indices(header.shape[0])
+        budget().require_reading(path, 2 * 4 * (last - first) * header.shape[1])
+        values: np.ndarray = outside(_lines, path, name, first, last)
+        return values[:, columns]
+
+    return Plane(header.shape, window)
+
+
+def _lines(path: str, name: str, first: int, last: int) -> np.ndarray:
+    """Lines `first` to `last` of a channel (row, column); runs outside."""
+    with _opened(path) as source:
+        spec = source.spec()
+        at = spec.channelnames.index(name)
+        lines = source.read_scanlines(spec.y + first, spec.y + last, 0, at, at + 1, "float")
+        if lines is None:
+            raise InputError(f"is damaged: {oiio_error(source)}", path, "make or copy it again")
+        return np.asarray(lines, np.float32).reshape(last - first, spec.width)
 
 
 def channel_names(path: Name) -> list[str]:
@@ -257,14 +321,22 @@ def _opened(path: Name) -> Iterator[Any]:
         oiio_error(source)  # an error never fetched is printed when the process ends
 
 
+def _texts(spec: Any) -> dict[str, str]:
+    return {a.name: a.value for a in spec.extra_attribs if isinstance(a.value, str)}
+
+
 def _check_header(path: Name, source: Any, spec: Any, most: int | None) -> None:
+    _check_kind(path, source, spec)
+    declared = spec.width * spec.height * spec.nchannels * 4
+    require_at_most(path, declared, most)
+    budget().require_declared(path, declared, declared)
+
+
+def _check_kind(path: Name, source: Any, spec: Any) -> None:
     import OpenImageIO as oiio
 
     if spec.deep:
         raise InputError("is a deep EXR", path, "flatten it first")
-    declared = spec.width * spec.height * spec.nchannels * 4
-    require_at_most(path, declared, most)
-    budget().require_declared(path, declared, declared)
     formats = spec.channelformats or (spec.format,) * spec.nchannels
     if any(f.basetype not in (oiio.FLOAT, oiio.HALF) for f in formats):
         raise InputError(

@@ -176,7 +176,7 @@ def _told(parameters: Any) -> ToldFigures:
 
 
 def _from_exr(path: Path) -> Result:
-    from plenocli.files.images.exr import read_exr
+    from plenocli.files.images.exr import read_exr, read_header, stored_channel
     from plenocli.files.images.spectral_exr import is_spectral, read_spectral_exr
 
     if is_spectral(path):
@@ -189,6 +189,14 @@ def _from_exr(path: Path) -> Result:
             deviation=None if spectral.sigma is None else Plane.of(spectral.sigma),
             quantity=spectral.quantity,
             method=str(spectral.attrs.get("method", "")),
+        )
+    header = read_header(path)
+    if header.by_lines and len(header.names) == 1:
+        return Result(
+            path=path,
+            kind="image",
+            plane=stored_channel(path, header, header.names[0]),
+            method=str(header.attrs.get("method", "")),
         )
     channels, attrs = read_exr(path)
     if "Y" not in channels and len(channels) != 1:

@@ -97,15 +97,20 @@ class Crosstalk:
     def spectra(self, method: str) -> Spectra:
         """By "coupled", "fine" or the best of all, "auto"."""
         # fine makes patterns of a field of what is wrong with F, most where it is predicted
-        name, answer = "coupled", self.first
+        answers = {"coupled": self.first}
         if method == "fine" or (method == "auto" and not self.c.predicted):
             stepped = likeliest(self.capture, self.first, self.light)
-            if method == "fine" or not all(stepped):
-                name, answer = "fine", fine(self.capture, self.first, self.light, stepped)
+            # what was fitted may be an edge inside a field
+            light = self.first.light if all(stepped) else self.light
+            found = {"fine": fine(self.capture, self.first, light, stepped)}
+            answers = answers | found if all(stepped) else found
         if method in METHODS:
-            return self._told(answer, method, method, "asked for")
-        error = {name: float(np.nanmean(answer.sigma[self.c.valid] ** 2))}
-        biases = {}
+            return self._told(answers[method], method, method, "asked for")
+        error = {
+            one: float(np.nanmean(each.sigma[self.c.valid] ** 2)) for one, each in answers.items()
+        }
+        name = min(error, key=lambda one: error[one])
+        answer, biases = answers[name], {}
         # wls and lmmse lean on dark pixels, where neighbours' light lies: pinv in all of 40 cases
         for other in ("pinv", "single-pixel"):
             guess = self._alone(self._noiseless(answer), other)
@@ -117,9 +122,9 @@ class Crosstalk:
         )
         if used == name:
             return self._told(answer, "auto", name, why)
-        found = self._alone(self.values, used)
-        sigma = np.hypot(found.sigma, biases[used]).astype(found.sigma.dtype)
-        return _spectra(found, found.value, sigma, found.residual, Trace(asked="auto", reason=why))
+        alone = self._alone(self.values, used)
+        sigma = np.hypot(alone.sigma, biases[used]).astype(alone.sigma.dtype)
+        return _spectra(alone, alone.value, sigma, alone.residual, Trace(asked="auto", reason=why))
 
     def _noiseless(self, answer: LatticeAnswer) -> np.ndarray:
         """The capture that an answer makes, as far as it was looked at."""

@@ -70,7 +70,7 @@ def volume_of_part(problem: Problem, other: Volume, like: np.ndarray | None = No
     like: as in volume_of, of this part.
     """
     if like is not None:
-        return volume_of(problem, other.method, like)
+        return total_variation(problem, like=like)
     linear = {} if other.sigma is None else {"uneven": is_uneven(other.value)}
     return SOLVERS[other.method](problem, **linear)
 

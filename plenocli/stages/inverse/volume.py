@@ -67,7 +67,8 @@ class VolumeSummary(Record):
                 f"; {self.like_factor:.3g} of the other volume is {self.like_share:.0%} of what "
                 "varies"
                 if self.like_factor
-                else "; it is not tied to the other volume, whose structure it does not show"
+                else "; it is not tied to the other volume: its structure is another, or held-out "
+                "pixels object"
             )
         return f"{text}; {self.margin} lenslets along the border miss light"
 
@@ -147,8 +148,8 @@ def run_volume(
     if most_planes is not None:
         stack, trials = _supported(tiles, most_planes)
         tiles = Tiles(stack, measurement, method, **how)
-    if like is not None and other is not None:
-        tiles.like = same_voxels(other, stack, (rows, columns), like)
+    if other is not None:
+        tiles.like = same_voxels(other, stack, (rows, columns), str(like))
     if len(tiles.windows) > 1:
         size = by(tiles.windows[0].weight.shape)
         note(f"in {len(tiles.windows)} windows of {size} lenslets: --mem-limit allows no more")
@@ -164,8 +165,8 @@ def run_volume(
     )
     _write(output, volume, stack, provenance, overwrite, there.name)
     summary = _summary(output, volume, stack)
-    if like is not None and other is not None and summary.explained_db is not None:
-        _tell_of_the_clearer(summary.explained_db, other, like)
+    if other is not None and summary.explained_db is not None:
+        _tell_of_the_clearer(summary.explained_db, other, str(like))
     return summary
 
 
@@ -188,7 +189,7 @@ def _summary(output: Path, volume: Volume, stack: Stack) -> VolumeSummary:
     )
 
 
-def _tell_of_the_clearer(explained_db: float, other: StoredVolume, path: Path | str) -> None:
+def _tell_of_the_clearer(explained_db: float, other: StoredVolume, path: str) -> None:
     """Say so where the other volume, by its held-out pixels, is the less clear one."""
     others_db = other.facts.get("held_out.explained_db")
     if others_db is not None and others_db < explained_db - CLEARER_DB:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from plenocli.base.linear_maps import BlockToeplitz
 from plenocli.base.tiling import to_blocks, to_plane
 from plenocli.inverse.picture import error_bars
 from plenocli.inverse.picture.estimators import Estimators, root_mean_square
@@ -91,13 +92,8 @@ def own_light(estimators: Estimators, y: np.ndarray, x: np.ndarray) -> np.ndarra
     beyond = to_blocks(
         np.pad(planes, [(0, 0), *((reach * k, reach * k) for k in shape)], mode="symmetric"), shape
     )
-    own, (rows, columns) = y.copy(), y.shape[:2]
-    for block, offset in zip(system.blocks, system.offsets):
-        if offset.any():
-            r, c = reach - offset
-            from_there = beyond[r : r + rows, c : c + columns].reshape(rows * columns, -1)
-            own -= (from_there.astype(block.dtype) @ block.T).reshape(y.shape)
-    return own
+    lattice = BlockToeplitz(system.blocks, system.offsets, beyond.shape[:2])
+    return y - lattice.neighbours_only().forward(beyond)[reach:-reach, reach:-reach]
 
 
 def left_over(estimators: Estimators, joint: JointEstimate) -> float:

@@ -495,6 +495,22 @@ wavelengths = ["550 nm"]
 """
 
 
+def test_planes_that_coarse_voxels_do_not_tell_apart_are_named(tmp_path, capsys):
+    """Light of f/8 upon lenslets 98.57 um apart: the finest period is 4.4 um, and discs of things at
+    450 and 540 mm, 1.25 and 0.1 mm behind and before the lenslets, are 156 and 13 um.
+    """
+    text = CAMERA.replace('["480 mm", "640 mm"]', '["450 mm", "540 mm"]')
+    path = tmp_path / "camera.toml"
+    path.write_text(text)
+    run_simulate_pif(path, None, Settings(model="ray", accuracy=1.0), explain=True)
+    told = capsys.readouterr().err
+    assert "what is at 540 mm will" in told and "voxels of 49.3 um" in told
+    assert "resolves 4.4 um; samples_per_lenslet = [23, 23]" in told
+    path.write_text(text.replace("samples_per_lenslet = [2, 2]", "samples_per_lenslet = [23, 23]"))
+    run_simulate_pif(path, None, Settings(model="ray", accuracy=1.0), explain=True)
+    assert "too coarse" not in capsys.readouterr().err
+
+
 @pytest.fixture(scope="module")
 def sheets(tmp_path_factory):
     """Folder with a camera, a sheet with a rim of nothing, and one behind it."""

@@ -102,6 +102,11 @@ class VolumeOptics:
         return self.pitch / self.magnification
 
     @property
+    def resolved(self) -> float:
+        """Finest period that the pupil lets through in the focused plane, m."""
+        return self.wavelength / (2 * self.aperture)
+
+    @property
     def row_spacing(self) -> float:
         """Of lenslets, pitches."""
         return ROW_SPACING if self.lattice == "hexagonal" else 1.0

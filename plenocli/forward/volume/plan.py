@@ -7,6 +7,7 @@ accuracy is taken. Errors are shares of a column's light that is elsewhere, half
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -42,6 +43,10 @@ TRIED_BLUR = 4.0
 """Lenslets on each side that the deepest point that is tried lights."""
 DEEPER = 1.6
 """Error of deeper points over that of the deepest that is tried (measured to 17 lenslets)."""
+COARSE, SPANNED = 1.1, 2.0
+"""Voxels over what a lens resolves, up to which they are as fine; voxels that the light of a plane
+from all of the pupil meets, from which on coarser ones do.
+"""
 BOX = 2
 """Points along each side of a voxel that stand for it, its light being their mean."""
 OVERHEAD = 1.9
@@ -250,6 +255,17 @@ def between_planes(optics: VolumeOptics, plan: VolumePlan) -> float:
     rung = plan.pixel_nodes, plan.neighbours
     first, middle, last = (_column(optics, rung, z, reach) for z in (low, (low + high) / 2, high))
     return float(0.5 * np.abs(middle - (first + last) / 2).sum(dtype=float))
+
+
+def coarse_planes(optics: VolumeOptics, samples: Sequence[int]) -> list[int]:
+    """Numbers of the planes whose light, from all of the pupil, meets less than SPANNED voxels of
+    `samples` (rows, columns) a lenslet that are coarser than what the lens resolves: what is there
+    is taken for something in front of it or behind (docs/results.md, "Volumes").
+    """
+    voxel = optics.object_pitch / min(samples)
+    if voxel <= COARSE * optics.resolved:
+        return []
+    return [n for n, z in enumerate(optics.depths) if 2 * _blur(optics, z) < SPANNED * voxel]
 
 
 def _reach(optics: VolumeOptics, depth: float, lost: float) -> tuple[int, float]:

@@ -84,7 +84,7 @@ def along_the_grid(
             f"{capture.name}: the lenslets lie {moved[0]:+.2f} rows and {moved[1]:+.2f} columns "
             "from where the white image has them; superpixels are taken there"
         )
-    cut, white, usable = (_binned(a, window_shape, bins) for a in (cut, white, usable * 1.0))
+    cut, white, usable = (binned(a, window_shape, bins) for a in (cut, white, usable * 1.0))
     even = system.blocks.sum(axis=(0, 2), dtype=float)
     white, dusty = typical_white(white, lit)
     usable = (usable > 0.99) & ~dusty & (even > DARK * even.max()) & (white > 0)
@@ -237,7 +237,7 @@ def _pasted(
     return image[tuple(nearest)]
 
 
-def _binned(values: np.ndarray, shape: tuple[int, int], bins: tuple[int, int]) -> np.ndarray:
+def binned(values: np.ndarray, shape: tuple[int, int], bins: tuple[int, int]) -> np.ndarray:
     """(.., pixel) averaged over bins (rows, columns) of pixels."""
     rows, columns = shape[0] // bins[0], shape[1] // bins[1]
     parts = values.reshape(*values.shape[:-1], rows, bins[0], columns, bins[1])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,7 +17,7 @@ from plenocli.forward.sensor.cfa import cfa_map
 from plenocli.forward.sensor.frames import saturated
 from plenocli.forward.sensor.superpixel import extract
 from plenocli.inverse.calibration.calibration import there
-from plenocli.inverse.picture.real_light import above_dark, pixel_noise, sampled
+from plenocli.inverse.picture.real_light import above_dark, binned, pixel_noise, sampled
 from plenocli.inverse.volume.measurement import Measurement
 
 if TYPE_CHECKING:
@@ -45,7 +46,8 @@ def measured(
     capture calls one.
 
     stack: the kernels, which say how many pixels superpixels have, and on what lattice.
-    calibration: with grid, white and dark, along which real captures are resampled; where the white
+    calibration: with grid, white and dark, along which real captures are resampled, several pixels
+        of theirs to one of the kernels where these have a whole part of them; where the white
         image shows another light than the kernels have of an even object, pixels are made what they
         would be behind the camera that is described. None: the capture is tiled as it says itself.
     where: the calibration's file, for messages.
@@ -149,9 +151,14 @@ def _sampled(
     step: tuple[float, float],
     corners: list[tuple[int, int]],
 ) -> np.ndarray:
-    """As `sampled`, of each corner's pixels alone, and NaN where those of none are the nearest."""
+    """As `sampled`, of each corner's pixels alone, and NaN where those of none are the nearest;
+    means of as many samples as a step has whole pixels.
+    """
+    bins = _bins(step)
+    step = step[0] / bins[0], step[1] / bins[1]
+    shape = shape[0] * bins[0], shape[1] * bins[1]
     if not corners:
-        return sampled(image, centres, shape, step)
+        return binned(sampled(image, centres, shape, step), shape, bins)
     values = np.full((*centres.shape[:-1], *shape), np.nan)
     axes = [
         np.rint(centres[..., axis, None] + (np.arange(n) - (n - 1) / 2) * s) % 2
@@ -163,7 +170,12 @@ def _sampled(
         part = sampled(every, (centres - (row, column)) / 2, shape, half).reshape(values.shape)
         nearest = (axes[0] == row)[..., :, None] & (axes[1] == column)[..., None, :]
         values = np.where(nearest, part, values)
-    return values.reshape(*centres.shape[:-1], -1)
+    return binned(values.reshape(*centres.shape[:-1], -1), shape, bins)
+
+
+def _bins(step: tuple[float, float]) -> tuple[int, int]:
+    """Whole pixels of the sensor (rows, columns) in one of the kernels."""
+    return max(1, round(step[0])), max(1, round(step[1]))
 
 
 def _step(calibration: Calibration, shape: tuple[int, int], lattice: str) -> tuple[float, float]:
@@ -237,13 +249,15 @@ def _resampled(
 ) -> Measurement:
     grid, white = calibration.grid, calibration.white
     step = _step(calibration, shape, lattice)
-    if max(abs(s - 1) for s in step) > 0.1:
+    corners, bins = _corners(capture.cfa, channel), _bins(step)
+    if max(abs(s / b - 1) for s, b in zip(step, bins)) > 0.1 or (corners and bins != (1, 1)):
         rows, columns = (s * n for s, n in zip(step, shape))
         raise InputError(
             f"has lenslets {rows:.4g} x {columns:.4g} pixels apart, the kernels {by(shape)} pixels "
             "a lenslet",
             where,
-            "describe the camera with sensor.pixels_per_lenslet as measured, to the nearest pixel",
+            "describe the camera with sensor.pixels_per_lenslet as measured, to the nearest pixel"
+            + ("" if corners else ", or a whole part of it"),
         )
     if white is None or white.level is None or white.superpixels is None:
         raise InputError("holds no white image", where, "calibrate with one (--white)")
@@ -251,7 +265,6 @@ def _resampled(
     if np.isfinite(capture.levels.white):
         over = saturated(capture.mosaic, capture.levels.black, capture.levels.white)
         signal = np.where(over, np.nan, signal)
-    corners = _corners(capture.cfa, channel)
     cut = _sampled(signal, grid.centres, shape, step, corners)
     level = np.where(grid.valid, white.level, np.nan)
     if corners and white.flat is not None:
@@ -272,8 +285,8 @@ def _resampled(
         signal, good = (np.pad(a, ((1, 0), (0, 0), (0, 0))) for a in (signal, good))
     return Measurement(
         signal=signal,
-        read_variance=noise.without_signal / usual**2,
-        gain=noise.gain / usual,
+        read_variance=noise.without_signal / usual**2 / math.prod(bins),
+        gain=noise.gain / usual / math.prod(bins),
         usable=good,
     )
 

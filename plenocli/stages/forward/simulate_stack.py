@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -9,10 +10,12 @@ from typing import TYPE_CHECKING, Any
 from plenocli.base.errors import UsageError
 from plenocli.base.progress import bar, note
 from plenocli.base.text import by
+from plenocli.base.units import format_length
 
 if TYPE_CHECKING:
     from plenocli.forward.camera.microscope import Microscope
     from plenocli.forward.camera.model import Camera
+    from plenocli.forward.volume.optics import VolumeOptics
     from plenocli.forward.volume.plan import VolumePlan
 
 DEFAULT_ACCURACY = 5e-3
@@ -135,6 +138,8 @@ def run_simulate_stack(
     asked = DEFAULT_ACCURACY if accuracy is None else accuracy
     plan = plan_volume(optics, samples, accuracy=asked, model=model)
     between = between_planes(optics, plan)
+    if camera is not None:
+        _tell_of_the_voxels(optics, samples)
     if explain or output is None:
         return StackSummary(output=None, plan=plan, samples=samples, between_planes=between)
     if plan.seconds > LONG:
@@ -152,6 +157,23 @@ def run_simulate_stack(
     )
     write_artefact(output, stack_artefact(stack, provenance), overwrite=overwrite)
     return StackSummary(output=str(output), plan=plan, samples=samples, between_planes=between)
+
+
+def _tell_of_the_voxels(optics: VolumeOptics, samples: tuple[int, int]) -> None:
+    """Say which planes are not told apart by voxels as coarse as these."""
+    from plenocli.forward.volume.plan import coarse_planes
+
+    planes = coarse_planes(optics, samples)
+    if not planes:
+        return
+    places = ", ".join(format_length(optics.places[n]) for n in planes)
+    enough = math.ceil(optics.object_pitch / optics.resolved)
+    note(
+        f"what is at {places} will be taken for something in front of it or behind: voxels of "
+        f"{optics.object_pitch / min(samples) * 1e6:.3g} um are too coarse so near the focused "
+        f"plane, where the lens resolves {optics.resolved * 1e6:.3g} um; samples_per_lenslet = "
+        f"[{enough}, {enough}] has them as fine, or name no planes there"
+    )
 
 
 def _with_measured_pupil(microscope: Microscope, calibration: Path | str) -> Microscope:

@@ -6,8 +6,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from plenocli.base.errors import UsageError
+from plenocli.base.errors import InputError, UsageError
 from plenocli.forward.sensor.capture import Capture
+from plenocli.forward.sensor.noise import Noise
 from plenocli.inverse.volume.superpixels import measured
 from tests.reference.calibrations import drawn_calibration, lenslet_grid
 
@@ -104,3 +105,43 @@ def test_channels_that_a_sensor_does_not_have_are_refused(in_colour):
         measured(shot, stack, known)
     with pytest.raises(UsageError, match="none"):
         measured(replace(shot, cfa="mono"), stack, known, channel="R")
+
+
+def test_kernels_of_a_whole_part_of_the_pixels_see_the_means_of_as_many():
+    """Lenslets 28 x 42 px apart, in the middle between pixels, kernels of 14 x 14: blocks of 2 x 3
+    pixels, averaged here; noise falls with their number.
+    """
+    index = np.stack(np.meshgrid(*map(np.arange, COUNT), indexing="ij"), axis=-1)
+    centres = 20.5 + index * np.array([28.0, 42.0])
+    centres[..., 1] += 6
+    shape = (20 + 28 * COUNT[0], 26 + 42 * COUNT[1])
+    grid = lenslet_grid(centres, np.diag([28.0, 42.0]))
+    values = np.random.default_rng(3).uniform(0.2, 1, COUNT)
+    even = drawn_calibration(grid, np.full(shape, 200.0))
+    shot = Capture(
+        mosaic=200.0 * drawn(centres, shape, values), noise=Noise(gain=0.5, read_variance=9.0)
+    )
+
+    def stack(rows, columns):
+        return SimpleNamespace(
+            lattice="square",
+            lenslets=1,
+            pixel_shape=(rows, columns),
+            even=lambda: np.ones(rows * columns),
+        )
+
+    fine, found = measured(shot, stack(28, 42), even), measured(shot, stack(14, 14), even)
+    blocks = fine.signal.reshape(*COUNT, 14, 2, 14, 3).mean(axis=(3, 5))
+    assert found.usable.all()
+    assert np.allclose(found.signal.reshape(blocks.shape), blocks, atol=1e-9)
+    assert found.gain == pytest.approx(fine.gain / 6)
+    assert found.read_variance == pytest.approx(fine.read_variance / 6)
+    with pytest.raises(InputError, match="a whole part of it"):
+        measured(shot, stack(14, 17), even)
+
+
+def test_one_colours_pixels_are_taken_as_they_are(in_colour):
+    shot, stack, known, _ = in_colour
+    half = SimpleNamespace(**{**vars(stack), "pixel_shape": (7, 7), "even": lambda: np.ones(49)})
+    with pytest.raises(InputError, match="to the nearest pixel$"):
+        measured(shot, half, known, channel="G")

@@ -496,8 +496,8 @@ wavelengths = ["550 nm"]
 
 
 def test_planes_that_coarse_voxels_do_not_tell_apart_are_named(tmp_path, capsys):
-    """Light of f/8 upon lenslets 98.57 um apart: the finest period is 4.4 um, and discs of things at
-    450 and 540 mm, 1.25 and 0.1 mm behind and before the lenslets, are 156 and 13 um.
+    """Light of f/8 upon lenslets 98.57 um apart: the finest period is 4.4 um, and discs of things
+    at 450 and 540 mm, 1.25 and 0.1 mm behind and before the lenslets, are 156 and 13 um.
     """
     text = CAMERA.replace('["480 mm", "640 mm"]', '["450 mm", "540 mm"]')
     path = tmp_path / "camera.toml"

@@ -17,7 +17,15 @@ from plenocli.forward.sensor.cfa import cfa_map
 from plenocli.forward.sensor.frames import saturated
 from plenocli.forward.sensor.superpixel import extract
 from plenocli.inverse.calibration.calibration import there
-from plenocli.inverse.picture.real_light import above_dark, binned, pixel_noise, sampled
+from plenocli.inverse.picture.real_light import (
+    DUST,
+    NORMAL,
+    UNLIKE,
+    above_dark,
+    binned,
+    pixel_noise,
+    sampled,
+)
 from plenocli.inverse.volume.measurement import Measurement
 
 if TYPE_CHECKING:
@@ -29,6 +37,10 @@ EDGE = 0.1
 """Of the brightest pixel of white, below which one at the pupil's edge counts for nothing."""
 MOST_TURN = 3.0
 """Degrees by which superpixels may be turned."""
+FEWEST, LEAST_DUST = 16, 0.02
+"""Lenslets whose white image tells what a pixel has in common with others; what dust takes away at
+the least, of the light of a pixel.
+"""
 DIM = 0.05
 """Of the usual white level, below which a lenslet counts for nothing."""
 
@@ -280,6 +292,9 @@ def _resampled(
     usable = np.isfinite(raw) & np.isfinite(seen) & lit[..., None]
     noise = pixel_noise(capture, calibration, raw, seen, usable)
     good = np.isfinite(cut) & lit[..., None]
+    if not corners and white.flat is not None:
+        clear, dusty = _dust(_sampled(white.flat, grid.centres, shape, step, []), lit)
+        cut, good = cut / clear, good & ~dusty
     signal = np.where(good, cut, 0.0) / even / usual
     if lattice == "hexagonal" and _starts_aside(grid.centres):
         signal, good = (np.pad(a, ((1, 0), (0, 0), (0, 0))) for a in (signal, good))
@@ -289,6 +304,31 @@ def _resampled(
         gain=noise.gain / usual / math.prod(bins),
         usable=good,
     )
+
+
+def _dust(white: np.ndarray, lit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What dust lets through of the light of each pixel, and which pixels lie under it.
+
+    white: (lenslet_row, lenslet_column, pixel) of the white image, NaN where it is not known.
+    lit: (lenslet_row, lenslet_column), which of them count.
+    """
+    clear, seen = np.ones(white.shape), np.isfinite(white) & lit[..., None]
+    counts = seen.sum(axis=(0, 1)) >= FEWEST
+    known = np.where(seen & counts, white, np.nan)[..., counts]
+    if not known.size:
+        return clear, np.zeros(white.shape, bool)
+    common = np.nanmedian(known, axis=(0, 1))
+    share = known / np.where(common > 0, common, np.nan)
+    # each lenslet has its own brightness, of which a median sees no dust
+    level = np.full(lit.shape, np.nan)
+    some = np.isfinite(share).any(axis=2)
+    level[some] = np.nanmedian(share[some], axis=1)
+    share /= level[..., None]
+    spread = NORMAL * np.nanmedian(np.abs(share - 1), axis=(0, 1))
+    unlike = np.abs(share - 1) > np.maximum(UNLIKE * spread, LEAST_DUST)
+    clear[..., counts] = np.where(unlike, share, 1.0)
+    dusty = clear < DUST
+    return np.where(dusty, 1.0, clear), dusty
 
 
 def _starts_aside(centres: np.ndarray) -> bool:

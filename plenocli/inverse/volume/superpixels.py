@@ -293,8 +293,14 @@ def _resampled(
     noise = pixel_noise(capture, calibration, raw, seen, usable)
     good = np.isfinite(cut) & lit[..., None]
     if not corners and white.flat is not None:
-        clear, dusty = _dust(_sampled(white.flat, grid.centres, shape, step, []), lit)
-        cut, good = cut / clear, good & ~dusty
+        seen_white = _sampled(white.flat, grid.centres, shape, step, [])
+        through = _through_dust(seen_white, lit)
+        # the level, too, is that of what dust let through
+        mean = np.nan_to_num(seen_white[lit]).mean(axis=0)
+        shade = np.percentile(mean * through, 98, axis=2) / np.percentile(mean, 98)
+        even = even / shade[..., None]
+        good &= through >= DUST
+        cut = cut / through
     signal = np.where(good, cut, 0.0) / even / usual
     if lattice == "hexagonal" and _starts_aside(grid.centres):
         signal, good = (np.pad(a, ((1, 0), (0, 0), (0, 0))) for a in (signal, good))
@@ -306,17 +312,17 @@ def _resampled(
     )
 
 
-def _dust(white: np.ndarray, lit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """What dust lets through of the light of each pixel, and which pixels lie under it.
+def _through_dust(white: np.ndarray, lit: np.ndarray) -> np.ndarray:
+    """What dust lets through of the light of each pixel, 1 where there is none.
 
     white: (lenslet_row, lenslet_column, pixel) of the white image, NaN where it is not known.
     lit: (lenslet_row, lenslet_column), which of them count.
     """
-    clear, seen = np.ones(white.shape), np.isfinite(white) & lit[..., None]
+    through, seen = np.ones(white.shape), np.isfinite(white) & lit[..., None]
     counts = seen.sum(axis=(0, 1)) >= FEWEST
     known = np.where(seen & counts, white, np.nan)[..., counts]
     if not known.size:
-        return clear, np.zeros(white.shape, bool)
+        return through
     common = np.nanmedian(known, axis=(0, 1))
     share = known / np.where(common > 0, common, np.nan)
     # each lenslet has its own brightness, of which a median sees no dust
@@ -326,9 +332,8 @@ def _dust(white: np.ndarray, lit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     share /= level[..., None]
     spread = NORMAL * np.nanmedian(np.abs(share - 1), axis=(0, 1))
     unlike = np.abs(share - 1) > np.maximum(UNLIKE * spread, LEAST_DUST)
-    clear[..., counts] = np.where(unlike, share, 1.0)
-    dusty = clear < DUST
-    return np.where(dusty, 1.0, clear), dusty
+    through[..., counts] = np.where(unlike, np.maximum(share, LEAST_DUST), 1.0)
+    return through
 
 
 def _starts_aside(centres: np.ndarray) -> bool:

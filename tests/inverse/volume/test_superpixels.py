@@ -145,3 +145,37 @@ def test_one_colours_pixels_are_taken_as_they_are(in_colour):
     half = SimpleNamespace(**{**vars(stack), "pixel_shape": (7, 7), "even": lambda: np.ones(49)})
     with pytest.raises(InputError, match="to the nearest pixel$"):
         measured(shot, half, known, channel="G")
+
+
+def test_dust_of_the_white_image_is_taken_off_or_left_out():
+    """Two spots over lenslets of even light, one lets a fifth through, the other 70 %; the specimen
+    lights each lenslet alike.
+    """
+    index = np.stack(np.meshgrid(*map(np.arange, COUNT), indexing="ij"), axis=-1)
+    centres, shape = 12.0 + index * np.array([13.0, 13.0]), (90, 103)
+    dust = np.ones(shape)
+    dust[22:29, 22:29], dust[48:55, 61:68] = 0.2, 0.7
+    grid = lenslet_grid(centres, np.diag([13.0, 13.0]))
+    stack = SimpleNamespace(
+        lattice="square", lenslets=1, pixel_shape=(13, 13), even=lambda: np.ones(169)
+    )
+    light = drawn(centres, shape, np.ones(COUNT)) + 0.2
+    lenslets = light * np.linspace(0.8, 1, shape[1])
+    found, clean = (
+        measured(
+            Capture(mosaic=200 * light * d), stack, drawn_calibration(grid, 200 * lenslets * d)
+        )
+        for d in (dust, 1.0)
+    )
+    usable = found.usable.reshape(*COUNT, 13, 13)
+    assert not usable[1, 1, 4:9, 4:9].any() and usable[1, 1, 0].all()
+    assert usable[3, 4, 4:9, 4:9].all() and clean.usable.all()
+    rim = np.ones((13, 13), bool)
+    rim[2:11, 2:11] = False  # about the spots values between pixels are mixed
+    inner = np.zeros((13, 13), bool)
+    inner[5:8, 5:8] = True
+    ratio = (found.signal / clean.signal).reshape(*COUNT, 13, 13)
+    # what all lenslets show together is evened, two spots of 42 lenslets by a fortieth as well
+    assert np.allclose(ratio[4, 5], 1, atol=0.04)
+    for lenslet, at in (((1, 1), rim), ((3, 4), rim), ((3, 4), inner)):
+        assert np.allclose(ratio[lenslet][at], ratio[4, 5][at], rtol=0.04)

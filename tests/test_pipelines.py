@@ -102,14 +102,15 @@ def test_a_second_run_does_nothing_and_a_change_reruns_what_depends_on_it(spatia
         Path(f"{file}.gone").rename(file)
 
 
-def test_the_same_run_gives_the_same_bytes(spatial, tmp_path):
-    """By the experiment of most options; the report of one has not what that of all has."""
+@pytest.mark.parametrize("only", ["EXPERIMENTS=stray", pytest.param("", marks=pytest.mark.slow)])
+def test_the_same_run_gives_the_same_bytes(spatial, tmp_path, only):
+    """By the experiment of most options, whose report has not what that of all has; and by all."""
     variables, _, run, _ = spatial
-    make("spatial", *variables[1:], f"RUN={tmp_path}/run", "EXPERIMENTS=stray")
+    make("spatial", *variables[1:], f"RUN={tmp_path}/run", *filter(None, [only]))
     made = tmp_path / "run"
     files = {p.relative_to(made) for p in made.rglob("*") if p.is_file()}
-    files -= {Path("report.html"), Path("SHA256SUMS")}
-    assert len(files) > 9
+    files -= {Path("report.html"), Path("SHA256SUMS")} if only else set()
+    assert len(files) > (9 if only else 12)
     assert [p for p in sorted(files) if (run / p).read_bytes() != (made / p).read_bytes()] == []
 
 

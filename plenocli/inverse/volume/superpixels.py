@@ -292,7 +292,7 @@ def _resampled(
     usable = np.isfinite(raw) & np.isfinite(seen) & lit[..., None]
     noise = pixel_noise(capture, calibration, raw, seen, usable)
     good = np.isfinite(cut) & lit[..., None]
-    if not corners and white.flat is not None:
+    if not corners and white.flat is not None and lit.any():
         seen_white = _sampled(white.flat, grid.centres, shape, step, [])
         through = _through_dust(seen_white, lit)
         # the level, too, is that of what dust let through
@@ -320,11 +320,12 @@ def _through_dust(white: np.ndarray, lit: np.ndarray) -> np.ndarray:
     """
     through, seen = np.ones(white.shape), np.isfinite(white) & lit[..., None]
     counts = seen.sum(axis=(0, 1)) >= FEWEST
-    known = np.where(seen & counts, white, np.nan)[..., counts]
-    if not known.size:
-        return through
+    known = np.where(seen, white, np.nan)[..., counts]
     common = np.nanmedian(known, axis=(0, 1))
-    share = known / np.where(common > 0, common, np.nan)
+    counts[counts] = common > 0
+    share = known[..., common > 0] / common[common > 0]
+    if not share.size:
+        return through
     # each lenslet has its own brightness, of which a median sees no dust
     level = np.full(lit.shape, np.nan)
     some = np.isfinite(share).any(axis=2)

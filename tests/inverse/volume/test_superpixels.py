@@ -1,5 +1,6 @@
 """Superpixels of a hexagonal array, drawn here by formula, in the cells that kernels have."""
 
+import warnings
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -179,3 +180,18 @@ def test_dust_of_the_white_image_is_taken_off_or_left_out():
     assert np.allclose(ratio[4, 5], 1, atol=0.04)
     for lenslet, at in (((1, 1), rim), ((3, 4), rim), ((3, 4), inner)):
         assert np.allclose(ratio[lenslet][at], ratio[4, 5][at], rtol=0.04)
+
+
+def test_pixels_whose_white_is_below_the_dark_level_are_no_dust():
+    index = np.stack(np.meshgrid(*map(np.arange, COUNT), indexing="ij"), axis=-1)
+    centres = 12.0 + index * np.array([13.0, 13.0])
+    light = drawn(centres, (90, 103), np.ones(COUNT))
+    known = drawn_calibration(lenslet_grid(centres, np.diag([13.0, 13.0])), 200 * light - 0.5)
+    stack = SimpleNamespace(
+        lattice="square", lenslets=1, pixel_shape=(13, 13), even=lambda: np.ones(169)
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = measured(Capture(mosaic=200 * light), stack, known)
+    usable = found.usable.reshape(*COUNT, 13, 13)
+    assert usable[..., 6, 6].all() and not usable[..., 0, 0].any()

@@ -257,14 +257,15 @@ def fitted(args):
                     points = tuple(slice(k * size * POINTS, (k + 1) * size * POINTS) for k in piece)
                     y = data.y[at]
                     signals = y.reshape(-1, y.shape[2]).T
-                    contrast = lmmse.contrast(signals)
+                    w = lmmse.coordinates(signals)
+                    contrast = lmmse.contrast(w)
                     scale = np.exp(np.log(SCALES) @ contrast)
-                    x = lmmse.apply(signals, scale).T.reshape(*y.shape[:2], -1)
-                    sigma = error_bars.spread(lmmse, signals, contrast).T.reshape(x.shape)
+                    x = lmmse.apply(signals, scale, w).T.reshape(*y.shape[:2], -1)
+                    sigma = error_bars.spread(lmmse, w, contrast).T.reshape(x.shape)
                     z = np.abs(x - to_blocks(whole[points], shape)) / sigma
                     rows.append(
                         (
-                            error_bars.weak_power(lmmse, signals, scale),
+                            error_bars.weak_power(lmmse, w, scale),
                             error_bars.disagreement(x, sigma, shape),
                             1.0,
                         )

@@ -73,26 +73,27 @@ def posterior(
     """
     rows, columns = y.shape[:2]
     signals = y.reshape(rows * columns, -1).T
-    contrast = lmmse.contrast(signals, common)
+    w = lmmse.coordinates(signals)
+    contrast = lmmse.contrast(w, common)
     scale = np.exp(np.log(SCALES) @ contrast)
     x, sigma = (
         found.T.reshape(rows, columns, -1)
-        for found in (lmmse.apply(signals, scale), spread(lmmse, signals, contrast))
+        for found in (lmmse.apply(signals, scale, w), spread(lmmse, w, contrast))
     )
 
     def wider() -> float:
         border = disagreement(x, sigma, shape)
-        weak = weak_power(lmmse, signals, scale)
+        weak = weak_power(lmmse, w, scale)
         return float(np.exp(BY_WEAK * weak + BY_BORDER * (border - USUAL_BORDER)))
 
     return x, sigma * common("wider", wider, (lmmse.sigma, float(lmmse.noise.sum())))
 
 
-def spread(lmmse: Lmmse, y: np.ndarray, contrast: np.ndarray) -> np.ndarray:
+def spread(lmmse: Lmmse, w: np.ndarray, contrast: np.ndarray) -> np.ndarray:
     """Standard deviation of each point given its superpixel, by the law of total variance over the
     contrast: the mean of what each contrast leaves, and what the estimate moves with it.
 
-    y: (pixel, signal).
+    w: (k, signal) coordinates.
     contrast: (scale, signal) probability of each of SCALES.
 
     Returns (point, signal).
@@ -103,22 +104,22 @@ def spread(lmmse: Lmmse, y: np.ndarray, contrast: np.ndarray) -> np.ndarray:
     middle = logs @ contrast
     doubt = np.maximum(logs**2 @ contrast - middle**2, 0)
     weaker = noise / np.exp(middle)
-    moved = lmmse.gain @ (lmmse.coordinates(y) * weaker / (lmmse.power[:, None] + weaker) ** 2)
+    moved = lmmse.gain @ (w * weaker / (lmmse.power[:, None] + weaker) ** 2)
     level = lmmse.even**2 @ np.sum(lmmse.levels**2, axis=1)
     return np.sqrt(left + moved**2 * doubt + lmmse.sigma**2 * level[:, None])
 
 
-def weak_power(lmmse: Lmmse, y: np.ndarray, scale: np.ndarray) -> float:
+def weak_power(lmmse: Lmmse, w: np.ndarray, scale: np.ndarray) -> float:
     """Logarithm of the power that directions which hardly stand above the noise have over what
     photographs of this contrast have there: its mean given all signals, 0 where there are none.
 
-    y: (pixel, signal).
+    w: (k, signal) coordinates.
     scale: (signal,) factor of the photographs' covariance.
     """
     expected = np.outer(lmmse.power / lmmse.noise, scale)
     weak = expected <= HARDLY
     expected = expected[weak]
-    found = (lmmse.coordinates(y) ** 2 / lmmse.noise[:, None])[weak]
+    found = (w**2 / lmmse.noise[:, None])[weak]
     logs = np.log(FACTORS)
     likelihood = np.array(
         [-0.5 * np.sum(np.log1p(f * expected) + found / (1 + f * expected)) for f in FACTORS]

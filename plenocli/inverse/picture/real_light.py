@@ -34,6 +34,8 @@ FLAT = 0.25
 """Share of the lenslets, those with the least structure, that tell the motion."""
 DARK = 0.02
 """Of the brightest pixel of white, below which a pixel has nothing to tell."""
+FEWEST = 16
+"""Lenslets whose white image tells what a pixel has in common with others."""
 UNLIKE = 6.0
 """Standard deviations from which on a pixel of white is not that of all lenslets: dust."""
 DUST = 0.5
@@ -186,20 +188,45 @@ def typical_white(white: np.ndarray, lit: np.ndarray) -> tuple[np.ndarray, np.nd
     """The white image with less noise: what all lenslets have in common, times the brightness of
     each; where a pixel differs from that beyond the noise, its own.
 
-    white: (lenslet_row, lenslet_column, pixel).
+    white: (lenslet_row, lenslet_column, pixel), NaN where it is not known.
     lit: (lenslet_row, lenslet_column), which of them count.
 
     Returns it, and which pixels lie under dust.
     """
     own = np.where(np.isfinite(white), white, 0.0)
-    level = own.mean(axis=2, keepdims=True)
-    if np.count_nonzero(lit) < 16:
+    found = in_common(white, lit)
+    if found is None:
         return own, np.zeros(white.shape, bool)
-    shares = own[lit] / np.where(level[lit] > 0, level[lit], 1.0)
-    common = np.median(shares, axis=0)
-    spread = NORMAL * np.median(np.abs(shares - common), axis=0)
-    unlike = np.abs(own - level * common) > UNLIKE * spread * level
-    return np.where(unlike, own, level * common), own < DUST * level * common
+    typical, spread = found
+    with np.errstate(invalid="ignore"):
+        kept = np.abs(own - typical) <= UNLIKE * spread * typical
+        return np.where(kept, typical, own), own < DUST * typical
+
+
+def in_common(white: np.ndarray, lit: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """The white image without dust: what lenslets have in common times the brightness of each, both
+    medians, of which dust on few lenslets and on less than half of one moves neither.
+
+    white, lit: as for typical_white.
+
+    Returns it, NaN where no lenslet or too few tell, and the spread of each pixel's share of it
+    (pixel,); None where too few lenslets are lit.
+    """
+    seen = np.isfinite(white) & lit[..., None]
+    counts = seen.sum(axis=(0, 1)) >= FEWEST
+    known = np.where(seen, white, np.nan)
+    common, spread = np.full((2, white.shape[2]), np.nan)
+    if counts.any():
+        common[counts] = np.nanmedian(known[..., counts], axis=(0, 1))
+    counts &= common > 0
+    if not counts.any():
+        return None
+    share = known[..., counts] / common[counts]
+    level = np.full((*lit.shape, 1), np.nan)
+    some = np.isfinite(share).any(axis=2)
+    level[some, 0] = np.nanmedian(share[some], axis=1)
+    spread[counts] = NORMAL * np.nanmedian(np.abs(share / level - 1), axis=(0, 1))
+    return level * np.where(counts, common, np.nan), spread
 
 
 def _bins(

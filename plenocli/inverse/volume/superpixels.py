@@ -23,6 +23,7 @@ from plenocli.inverse.picture.real_light import (
     UNLIKE,
     above_dark,
     binned,
+    in_common,
     pixel_noise,
     sampled,
 )
@@ -37,9 +38,9 @@ EDGE = 0.1
 """Of the brightest pixel of white, below which one at the pupil's edge counts for nothing."""
 MOST_TURN = 3.0
 """Degrees by which superpixels may be turned."""
-FEWEST, LEAST_DUST = 16, 0.02
-"""Lenslets whose white image tells what a pixel has in common with others; what dust takes away at
-the least, of the light of a pixel.
+LEAST_DUST, MOST_DUST = 0.02, 0.02
+"""Of a pixel's light, what dust takes away at the least, and what is left at the least: such pixels
+count for nothing anyhow.
 """
 DIM = 0.05
 """Of the usual white level, below which a lenslet counts for nothing."""
@@ -318,23 +319,13 @@ def _through_dust(white: np.ndarray, lit: np.ndarray) -> np.ndarray:
     white: (lenslet_row, lenslet_column, pixel) of the white image, NaN where it is not known.
     lit: (lenslet_row, lenslet_column), which of them count.
     """
-    through, seen = np.ones(white.shape), np.isfinite(white) & lit[..., None]
-    counts = seen.sum(axis=(0, 1)) >= FEWEST
-    known = np.where(seen, white, np.nan)[..., counts]
-    common = np.nanmedian(known, axis=(0, 1))
-    counts[counts] = common > 0
-    share = known[..., common > 0] / common[common > 0]
-    if not share.size:
-        return through
-    # each lenslet has its own brightness, of which a median sees no dust
-    level = np.full(lit.shape, np.nan)
-    some = np.isfinite(share).any(axis=2)
-    level[some] = np.nanmedian(share[some], axis=1)
-    share /= level[..., None]
-    spread = NORMAL * np.nanmedian(np.abs(share - 1), axis=(0, 1))
+    found = in_common(white, lit)
+    if found is None:
+        return np.ones(white.shape)
+    typical, spread = found
+    share = np.where(lit[..., None], white, np.nan) / typical
     unlike = np.abs(share - 1) > np.maximum(UNLIKE * spread, LEAST_DUST)
-    through[..., counts] = np.where(unlike, np.maximum(share, LEAST_DUST), 1.0)
-    return through
+    return np.where(unlike, np.maximum(share, MOST_DUST), 1.0)
 
 
 def _starts_aside(centres: np.ndarray) -> bool:

@@ -46,7 +46,7 @@ def test_a_contrast_that_is_sure_leaves_what_linear_algebra_leaves(lens):
     _, y = drawn(lens, 1.0, 4, 2)
     sure = np.zeros((len(solver.SCALES), 4))
     sure[[20, 30, 40, 50], range(4)] = 1
-    found = error_bars.spread(lmmse, y, sure)
+    found = error_bars.spread(lmmse, lmmse.coordinates(y), sure)
     for k, scale in enumerate(solver.SCALES[[20, 30, 40, 50]]):
         prior = scale * covariance + 1e4  # and a brightness about which nothing is known
         gain = np.linalg.solve(a @ prior @ a.T + SIGMA**2 * np.eye(60), a @ prior).T
@@ -61,9 +61,14 @@ def test_a_doubtful_contrast_adds_what_the_estimate_moves_with_it(lens):
     even = np.zeros((len(solver.SCALES), 50))
     even[pair] = 0.5
     estimates = np.stack([lmmse.apply(y, solver.SCALES[k]) for k in pair])
-    lefts = [error_bars.spread(lmmse, y, np.eye(len(even))[:, [k] * 50]) ** 2 for k in pair]
+    lefts = [
+        error_bars.spread(lmmse, lmmse.coordinates(y), np.eye(len(even))[:, [k] * 50]) ** 2
+        for k in pair
+    ]
     expected = np.mean(lefts, axis=0) + estimates.var(axis=0)
-    np.testing.assert_allclose(error_bars.spread(lmmse, y, even) ** 2, expected, rtol=2e-3)
+    np.testing.assert_allclose(
+        error_bars.spread(lmmse, lmmse.coordinates(y), even) ** 2, expected, rtol=2e-3
+    )
 
 
 def test_fields_of_the_prior_are_held_by_their_intervals(lens):
@@ -73,9 +78,9 @@ def test_fields_of_the_prior_are_held_by_their_intervals(lens):
     _, lmmse, _ = lens
     scale = np.exp(np.random.default_rng(4).standard_normal(1500))
     x, y = drawn(lens, scale, 1500, 5)
-    contrast = lmmse.contrast(y)
+    contrast = lmmse.contrast(lmmse.coordinates(y))
     z = (lmmse.apply(y, np.exp(np.log(solver.SCALES) @ contrast)) - x) / error_bars.spread(
-        lmmse, y, contrast
+        lmmse, lmmse.coordinates(y), contrast
     )
     assert np.mean(np.abs(z) < 1.96) == pytest.approx(0.95, abs=0.01)
     assert np.sqrt(np.mean(z**2)) == pytest.approx(1, abs=0.05)
@@ -89,7 +94,7 @@ def test_weak_directions_tell_their_power(lens, power):
     w = SIGMA * np.sqrt(1 + factor * expected)[:, None] * rng.standard_normal((len(expected), 900))
     y = np.linalg.pinv(lmmse.analysis) @ (w + lmmse.offset[:, None])
     np.testing.assert_allclose(lmmse.coordinates(y), w, atol=1e-8)
-    found = error_bars.weak_power(lmmse, y, np.ones(900))
+    found = error_bars.weak_power(lmmse, lmmse.coordinates(y), np.ones(900))
     assert found == pytest.approx(np.log(power), abs=0.2)
 
 
@@ -203,8 +208,10 @@ def test_detail_that_is_given_up_is_in_the_error_bars(lens):
     """Drawn halfway to the mean of each field, as the guard does, the intervals still hold."""
     _, lmmse, _ = lens
     x, y = drawn(lens, 1.0, 1500, 9)
-    contrast = lmmse.contrast(y)
+    contrast = lmmse.contrast(lmmse.coordinates(y))
     found = lmmse.apply(y, lmmse.scales(y))
     drawn_back = 0.5 * (found - found.mean(axis=0)) + found.mean(axis=0)
-    left = error_bars.about(drawn_back - found, error_bars.spread(lmmse, y, contrast))
+    left = error_bars.about(
+        drawn_back - found, error_bars.spread(lmmse, lmmse.coordinates(y), contrast)
+    )
     assert np.mean(np.abs(drawn_back - x) < 1.96 * left) == pytest.approx(0.95, abs=0.01)

@@ -253,11 +253,10 @@ def adaptive_lmmse(
 
 
 def _own_lmmse(estimators: Estimators, light: OwnLight) -> Estimate:
-    y = light.y[light.inner]
-    x, _ = adaptive_lmmse(estimators, light.data, y)
-    return Estimate(
-        value=x, sigma=error_bars.of_picture(estimators, light.data, y, x), from_lmmse=0.0
-    )
+    data, shape = light.data, estimators.system.object_shape
+    lmmse = estimators.prior.lmmse(data.known_sigma, data.scene)
+    x, sigma = error_bars.posterior(lmmse, light.y[light.inner], shape, data.common)
+    return Estimate(value=x, sigma=sigma, from_lmmse=0.0)
 
 
 def _by_lenslet(solve: Solve, bars: bool, estimators: Estimators, light: OwnLight) -> Estimate:

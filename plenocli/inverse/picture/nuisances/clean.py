@@ -237,7 +237,8 @@ class _Task:
         sign, clean = find_defects(
             self.model, own, unknown | clipped, self.estimators.system.pixel_shape, self.common
         )
-        sign[self._unsure(y, stray, own - clean)] = 0
+        if sign.any():
+            sign[self._unsure(y, stray, own - clean)] = 0
         hot = defects_among(self.model, own, clipped, (sign != 0) | unknown)
         sign[hot], clipped = 1, clipped & ~hot
         lost = unknown | (sign != 0)

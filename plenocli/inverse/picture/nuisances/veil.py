@@ -5,6 +5,7 @@ own, by generalised least squares under the model of LMMSE.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -111,10 +112,11 @@ def find_veil(
     Returns (what was found, None where an even object and an even light look alike; the light to
     take away, (signal,)).
     """
-    found, nothing = _offsets(model, y), np.zeros(y.shape[1])
-    veil, extra = common("veil", lambda: _common_veil(model, y, found, unsure))
+    offsets = cache(partial(_offsets, model, y))  # a part need not look where there is no veil
+    veil, extra = common("veil", lambda: _common_veil(model, y, offsets(), unsure))
     if veil is None or not veil.removed:
-        return veil, nothing
+        return veil, np.zeros(y.shape[1])
+    found = offsets()
 
     def level() -> float:
         own = _common_veil(model, y, found, unsure)[0]

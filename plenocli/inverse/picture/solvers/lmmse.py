@@ -58,11 +58,16 @@ class Lmmse:
     noise: np.ndarray
     sigma: float
 
-    def apply(self, y: np.ndarray, scale: float | np.ndarray = 1.0) -> np.ndarray:
+    def apply(
+        self,
+        y: np.ndarray,
+        scale: float | np.ndarray = 1.0,
+        coordinates: np.ndarray | None = None,
+    ) -> np.ndarray:
         """(pixel, signal) -> (point, signal), with the covariance times `scale`, a
-        number or one a signal.
+        number or one a signal; coordinates: those of y, where they are known.
         """
-        w = self.coordinates(y)
+        w = self.coordinates(y) if coordinates is None else coordinates
         return (
             self.even @ (self.levels @ y) + self.mean[:, None] + self.gain @ self.shrunk(w, scale)
         )
@@ -78,12 +83,13 @@ class Lmmse:
         """(x, sigma, scale) of y (pixel, signal) with a scale for each signal (see `scales`): the
         estimates and their predicted standard deviations (point, signal), the scales (signal,).
         """
-        scale = self.scales(y, common)
+        w = self.coordinates(y)
+        scale = np.exp(np.log(SCALES) @ self.contrast(w, common))
         left = self.gain**2 @ (1 / (self.power[:, None] + self.noise[:, None] / scale))
         left = scale * np.maximum(self.variance[:, None] - left, 0)
         # the patterns are orthogonal
         level = (self.even**2 @ np.sum(self.levels**2, axis=1))[:, None]
-        return self.apply(y, scale), np.sqrt(left + self.sigma**2 * level), scale
+        return self.apply(y, scale, w), np.sqrt(left + self.sigma**2 * level), scale
 
     def whitening(self) -> np.ndarray:
         """What of superpixels the estimate looks at, brightness first, weighted so that all of its
@@ -118,19 +124,19 @@ class Lmmse:
 
         Returns (signal,).
         """
-        return np.exp(np.log(SCALES) @ self.contrast(y, common))
+        return np.exp(np.log(SCALES) @ self.contrast(self.coordinates(y), common))
 
-    def contrast(self, y: np.ndarray, common: Common = alone) -> np.ndarray:
+    def contrast(self, w: np.ndarray, common: Common = alone) -> np.ndarray:
         """Probability of each of SCALES, (scale, signal), for each signal.
 
         Coordinates have variance scale power + noise. The prior of log scale is normal, with the
         mean and the deviation (at least 0.2) that make all signals together most likely; one signal
         alone says little where noise is strong.
 
-        y: (pixel, signal).
+        w: (k, signal) coordinates.
         common: gives that prior, of signals that are a part.
         """
-        likelihood = self._likelihood(self.coordinates(y))
+        likelihood = self._likelihood(w)
         likelihood = np.exp(likelihood - likelihood.max(axis=0))
         which = (self.sigma, float(self.noise.sum()))
         prior = common("contrasts", lambda: usual(likelihood, SCALES, 0.2), which)

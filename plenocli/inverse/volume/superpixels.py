@@ -19,7 +19,6 @@ from plenocli.forward.sensor.superpixel import extract
 from plenocli.inverse.calibration.calibration import there
 from plenocli.inverse.picture.real_light import (
     DUST,
-    NORMAL,
     UNLIKE,
     above_dark,
     binned,

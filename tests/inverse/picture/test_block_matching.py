@@ -11,6 +11,14 @@ from plenocli.forward.scene.sample import luminance, sample_picture
 from plenocli.inverse.picture.solvers import block_matching as denoise
 
 
+@pytest.fixture(autouse=True, params=["in arrays", "compiled"])
+def way(request, monkeypatch):
+    """Either way for pictures of any size."""
+    if request.param == "compiled":
+        pytest.importorskip("numba")
+    monkeypatch.setattr(denoise, "LARGE", 0 if request.param == "compiled" else np.inf)
+
+
 @pytest.fixture(scope="module")
 def noisy():
     truth = np.asarray(sample_picture(luminance(embedded_photograph("coffee")), 96, 96), float)
@@ -71,6 +79,14 @@ def test_what_was_found_alike_serves_the_next_picture(noisy):
     assert 50 > psnr(alike, own) > 35
     known.clear()
     np.testing.assert_array_equal(denoise.block_matching(noisy[0], 0.05, known), own)
+
+
+def test_both_ways_are_the_same(noisy, monkeypatch):
+    found = []
+    for large in (0, np.inf):
+        monkeypatch.setattr(denoise, "LARGE", large)
+        found.append(denoise.block_matching(noisy[1][:, :90], 0.05))
+    np.testing.assert_allclose(*found, atol=1e-6)
 
 
 def test_it_beats_total_variation(noisy):

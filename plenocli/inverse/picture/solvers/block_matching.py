@@ -4,12 +4,13 @@ Similar patches of a picture are stacked and transformed together (a cosine tran
 Walsh-Hadamard across the stack), shrunk there and put back, overlaps averaged with weights: K.
 Dabov, A. Foi, V. Katkovnik, K. Egiazarian, IEEE Trans. Image Processing 16 (2007) 2080. Written
 from the paper, in matrix products on strips of the picture, so that memory grows with its height
-by what is alike alone.
+by what is alike alone; of large pictures the rest is compiled where numba is there.
 """
 
 from __future__ import annotations
 
 from functools import lru_cache
+from types import ModuleType
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -22,6 +23,8 @@ THRESHOLD = 2.7
 """Coefficients below so many standard deviations of the noise vanish; the paper's value."""
 TOGETHER = 4096
 """Stacks that are filtered together."""
+LARGE = 250_000
+"""Points from which on a picture is worth the seconds in which the kernel is loaded."""
 
 
 Matched = dict[int, np.ndarray]
@@ -52,15 +55,29 @@ def block_matching(picture: np.ndarray, sigma: float, matched: Matched | None = 
     source = np.asarray(picture, np.float32)
     total, weight = np.zeros(picture.shape), np.zeros(picture.shape)
     matched = {} if matched is None else matched
+    kernel = _kernel() if picture.size >= LARGE else None
     for strip in np.array_split(rows, max(1, -(-len(rows) * len(columns) // TOGETHER))):
         span = slice(max(strip[0] - SEARCH, 0), min(strip[-1] + patch + SEARCH, picture.shape[0]))
         if strip[0] not in matched:
-            found = _match(source[span], strip - span.start, columns, patch, stack)
-            matched[strip[0]] = found.astype(np.int32)
-        one, two = _filter(source[span], matched[strip[0]], patch, sigma)
+            match = _match if kernel is None else kernel.match
+            found = match(source[span], strip - span.start, columns, patch, SEARCH, stack)
+            matched[strip[0]] = found.astype(np.int32, copy=False)
+        one, two = _filter(source[span], matched[strip[0]], patch, sigma, kernel)
         total[span] += one
         weight[span] += two
     return unit * total / weight
+
+
+@lru_cache(maxsize=1)
+def _kernel() -> ModuleType | None:
+    """The compiled functions, None where numba is missing: several times slower, the same but for
+    rounding.
+    """
+    try:
+        from plenocli.inverse.picture.solvers import block_matching_kernel
+    except ImportError:
+        return None
+    return block_matching_kernel
 
 
 def _corners(length: int, patch: int) -> np.ndarray:
@@ -71,19 +88,15 @@ def _corners(length: int, patch: int) -> np.ndarray:
 
 
 def _match(
-    source: np.ndarray, rows: np.ndarray, columns: np.ndarray, patch: int, stack: int
+    source: np.ndarray, rows: np.ndarray, columns: np.ndarray, patch: int, reach: int, stack: int
 ) -> np.ndarray:
-    """Flat corners (reference, stack) of the patches most like those with corners at rows x
-    columns, these first.
-    """
+    """As `match` of the kernel, in whole arrays; among patches that are equally like, any."""
     height, width = source.shape
     sum_rows = np.zeros((len(rows), height), np.float32)
     for k, first in enumerate(rows):
         sum_rows[k, first : first + patch] = 1
     up_to = np.zeros((len(rows), width + 1))
-    offsets = np.array(
-        [(r, c) for r in range(-SEARCH, SEARCH + 1) for c in range(-SEARCH, SEARCH + 1)]
-    )
+    offsets = np.array([(r, c) for r in range(-reach, reach + 1) for c in range(-reach, reach + 1)])
     distance = np.full((len(offsets), len(rows), len(columns)), np.inf, np.float32)
     for k, (down, right) in enumerate(offsets):
         r, c = (
@@ -116,42 +129,50 @@ def _match(
 
 
 def _filter(
-    source: np.ndarray, stacks: np.ndarray, patch: int, sigma: float
+    source: np.ndarray, stacks: np.ndarray, patch: int, sigma: float, kernel: ModuleType | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """(weighted sum, weights), each like source, of the filtered patches.
 
     Every patch of the plane is transformed once, and what stacks make of it is summed before it is
     transformed back.
     """
-    from scipy.sparse import csr_array
-
     shape = source.shape
     corners = (shape[0] - patch + 1, shape[1] - patch + 1)
-    cosine, across, taper = _transforms(patch, stacks.shape[1])
-    rows, columns = np.divmod(stacks.T.ravel(), shape[1])
-    at = rows * corners[1] + columns
-
+    cosine, _, taper = _transforms(patch, stacks.shape[1])
+    rows, columns = np.divmod(stacks, shape[1])
     patches = sliding_window_view(source, (patch, patch)).reshape(-1, patch * patch)
-    spectrum = across @ (patches @ cosine.T)[at].reshape(stacks.shape[1], -1)
-    spectrum = spectrum.reshape(stacks.shape[1], len(stacks), -1)
-    keep = np.abs(spectrum) > THRESHOLD * sigma
-    keep[0, :, 0] = True
-    spectrum *= keep
-    weight = 1 / keep.sum(axis=(0, 2), dtype=np.float32)
-    spectrum *= weight[:, None]
-    back = (across @ spectrum.reshape(stacks.shape[1], -1)).reshape(len(at), -1)
-    # which stacks each patch is in
-    order = np.argsort(at, kind="stable")
-    starts = np.searchsorted(at[order], np.arange(corners[0] * corners[1] + 1))
-    member = csr_array((np.ones(len(at), np.float32), order, starts), (len(starts) - 1, len(at)))
-    planes = (cosine.T @ (member @ back).T).reshape(patch, patch, *corners)
-    counted = (member @ np.tile(weight, stacks.shape[1])).reshape(corners)
+    shrink = _shrink if kernel is None else kernel.shrink
+    sums, counted = shrink(patches @ cosine.T, rows * corners[1] + columns, THRESHOLD * sigma)
+    planes = (cosine.T @ sums.T).reshape(patch, patch, *corners)
+    counted = counted.reshape(corners)
     total, weights = np.zeros(shape), np.zeros(shape)
     for r, c in np.ndindex(patch, patch):
         here = np.s_[r : r + corners[0], c : c + corners[1]]
         total[here] += taper[r * patch + c] * planes[r, c]
         weights[here] += taper[r * patch + c] * counted
     return total, weights
+
+
+def _shrink(
+    spectra: np.ndarray, stacks: np.ndarray, threshold: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """As `shrink` of the kernel, in whole arrays."""
+    from scipy.sparse import csr_array
+
+    count, at = stacks.shape[1], stacks.T.ravel()
+    across = _transforms(PATCH, count)[1]
+    spectrum = (across @ spectra[at].reshape(count, -1)).reshape(count, len(stacks), -1)
+    keep = np.abs(spectrum) > threshold
+    keep[0, :, 0] = True
+    spectrum *= keep
+    weight = 1 / keep.sum(axis=(0, 2), dtype=np.float32)
+    spectrum *= weight[:, None]
+    back = (across @ spectrum.reshape(count, -1)).reshape(len(at), -1)
+    # which stacks each patch is in
+    order = np.argsort(at, kind="stable")
+    starts = np.searchsorted(at[order], np.arange(len(spectra) + 1))
+    member = csr_array((np.ones(len(at), np.float32), order, starts), (len(starts) - 1, len(at)))
+    return member @ back, member @ np.tile(weight, count)
 
 
 @lru_cache(maxsize=8)

@@ -12,7 +12,7 @@ from plenocli.inverse.compiled import compiled
 TOGETHER = 64
 """Reference patches of a row that are compared together: their distances stay in the cache."""
 
-_jit = compiled(fastmath={"reassoc", "contract", "nsz"})
+_jit = compiled(fastmath={"reassoc", "contract", "nsz"}, forceinline=True)
 
 
 @_jit

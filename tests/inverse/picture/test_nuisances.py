@@ -2,6 +2,7 @@
 nothing of the factored ones.
 """
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -319,8 +320,12 @@ def test_pixels_that_are_known_to_be_bad_count_for_nothing():
     some = gone & (np.arange(49) != 5)
     assert np.abs(found - y)[some].max() < 10 * SIGMA and not found[:, 5].any()
     assert cleaned.findings[0].known == np.count_nonzero(some)
-    roughly = clean(estimators, data, look=False).data.y
+    unlooked = clean(estimators, data, look=False)
+    roughly = unlooked.data.y
     assert np.isfinite(roughly).all() and not roughly[0, 5].any()
+    for findings in (cleaned.findings, unlooked.findings):
+        told = json.loads(json.dumps([finding.as_json() for finding in findings]))
+        assert told[0]["defects"]["known"] == np.count_nonzero(some)
 
 
 def test_vignetting_is_what_the_white_has_over_even_light():

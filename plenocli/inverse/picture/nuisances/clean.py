@@ -107,7 +107,7 @@ def clean(
     else:
         level = data.common("clipped", lambda: piled_up(y))
         clipped = np.zeros(y.shape, bool) if level is None else y == level
-    before = _known_before(known, own.sum() * y.shape[1])
+    before = _known_before(known, int(own.sum()) * y.shape[1])
     bare = Cleaned(filled, (*before, *saturation(clipped[own], declared=declared)))
     if not look or blind.all() or not filled.y.any():
         return bare

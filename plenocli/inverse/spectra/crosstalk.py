@@ -84,11 +84,23 @@ class Crosstalk:
 
     def explains_more_than(self, other: Crosstalk) -> bool:
         """Whether it leaves less of the lenslets than another look at the same capture, by more
-        than they scatter.
+        than they scatter: of pixels that both explain, beside the noise alone, since what a
+        response has wrong, or leaves open, is no excuse.
         """
-        gain = other.first.residual - self.first.residual
+        both = (self.first.left != 0) & (other.first.left != 0)
+        gain = other._left(both) - self._left(both)
         gain = gain[np.isfinite(gain)]
         return len(gain) > 0 and bool(gain.mean() > SIGNIFICANT * gain.std() / np.sqrt(len(gain)))
+
+    def _left(self, which: np.ndarray) -> np.ndarray:
+        """Mean square (lenslet_row, lenslet_column) of what is left over that of the noise.
+
+        which: (lenslet_row, lenslet_column, pixel), that count.
+        """
+        f, count = np.nan_to_num(self.capture.response), which.sum(axis=-1)
+        noise = self.noise.variance(np.clip(self.first.value, 0, None) @ f.T)
+        power = np.where(which, self.first.left**2 / np.maximum(noise, 1e-12), 0).sum(axis=-1)
+        return np.asarray(power / np.where(count > 0, count, np.nan))
 
     def freed(self) -> np.ndarray:
         """The values as if every lenslet's neighbours were like itself."""

@@ -207,14 +207,14 @@ class Demultiplexer:
             if self.moving is None:
                 return each
         shift = motion.at(before.centres[before.sites]).mean(axis=0)
-        whole = np.rint(shift)
         known = 0 if before.variance is None else before.variance
-        c, shift = replace(before, origin=before.origin + whole.astype(int)), shift - whole
         for last in (False, False, True):
-            response, variance = self.moving.at(shift), known + self.moving.variance(shift)
+            whole = np.rint(shift)
+            c, rest = replace(before, origin=before.origin + whole.astype(int)), shift - whole
+            response, variance = self.moving.at(rest), known + self.moving.variance(rest)
             c = replace(c, response=response.astype(np.float32), variance=variance)
-            found = solved(c, self._at(light, shift))
-            step = np.clip(found.shift_step(self.moving, shift), -0.1, 0.1)
+            found = solved(c, self._at(light, rest))
+            step = np.clip(found.shift_step(self.moving, rest), -0.1, 0.1)
             if last or np.abs(step).max() < LEAST_STEP:
                 break
             shift = shift + step

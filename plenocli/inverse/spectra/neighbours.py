@@ -112,7 +112,7 @@ class NeighbourLight:
 
         Returns (superpixel, pixel, band).
         """
-        return self._kept(self._even(self.light), np.nan_to_num(response))
+        return self._kept(self._even(self.fine(response)), np.nan_to_num(response))
 
     def coupled_changes(self) -> np.ndarray:
         """What `changes` do to `coupled`: (change, superpixel, pixel, band)."""

@@ -2,6 +2,7 @@
 quite its own.
 """
 
+import functools
 from dataclasses import replace
 from pathlib import Path
 
@@ -71,15 +72,18 @@ def bench():
             "filter_array.size": described.filter_array.size * 1.005,
         }
     )
-    bands, matrices = camera.light.wavelengths, {}
-    for wavelength in bands:
-        builder = pif_builder(camera, wavelength, superpixels=(3, 3), model="fresnel")
-        matrices[wavelength] = StoredMatrix(builder.whole(), builder.offsets)
+    bands = camera.light.wavelengths
     light = Quadrature(wavelengths=np.array(bands), photons=np.ones(len(bands)))
 
-    def shoot(scene, source=light, seed=0, exposure=1.0):
+    @functools.cache
+    def matrices(shift):
+        moved = camera.with_fit(shift, 0.0)
+        builders = {w: pif_builder(moved, w, superpixels=(3, 3), model="fresnel") for w in bands}
+        return {w: StoredMatrix(one.whole(), one.offsets) for w, one in builders.items()}
+
+    def shoot(scene, source=light, seed=0, exposure=1.0, shift=(0.0, 0.0)):
         options = ExposureOptions(seed=seed, exposure=exposure * camera.light.white_exposure)
-        return simulate_capture(camera, source, scene, options, matrices=matrices).capture
+        return simulate_capture(camera, source, scene, options, matrices=matrices(shift)).capture
 
     white = shoot(Uniform(REFERENCE_REFLECTANCE), seed=1)
     narrow = {
@@ -224,6 +228,30 @@ def test_own_responses_of_lenslets_give_what_a_shared_one_does(bench, solve, che
     assert np.abs(each - shared).max() < 0.01 * shared.max()
     wrong = Crosstalk(one, light, values * gain[..., 0], noise).first.value
     assert np.abs(wrong - shared).max() > 0.02 * shared.max()
+
+
+def test_a_look_that_leaves_pixels_out_explains_no_more(bench):
+    """Edges inside fields show most at the rims of superpixels."""
+    camera, calibration, _, shoot = bench
+    c = LensletResponses.of(calibration)
+    signal, noise = readout(shoot(Mosaic(camera.light.wavelengths, 6, offset=0.4), seed=8), c, "x")
+    whole = windows_of(c, signal)
+    values = whole.copy()
+    values.reshape(*COUNT, 20, 20)[..., [0, 1, -2, -1], :] = np.nan
+    light = neighbours.neighbour_light(camera, calibration)
+    every, some = (Crosstalk(c, light, one, noise) for one in (whole, values))
+    assert np.nanmean(some.first.residual) < 0.95 * np.nanmean(every.first.residual)
+    assert not some.explains_more_than(every)
+
+
+def test_parts_of_a_pixel_cost_little(bench, solve, checkerboard):
+    """Light of the neighbours' own superpixels enters through the rim."""
+    camera, _, _, shoot = bench
+    truth, shot = checkerboard
+    moved = shoot(Mosaic(camera.light.wavelengths, 5), seed=7, shift=(0.4, -0.25))
+    still, found = solve(shot), solve(moved)
+    assert found.method == "coupled"
+    assert errors(found, truth)[0] < 1.5 * errors(still, truth)[0]
 
 
 def test_what_cannot_be_predicted_is_said(bench, capsys):

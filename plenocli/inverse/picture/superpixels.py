@@ -108,10 +108,12 @@ def _along_the_grid(
     """
     signal, white = windows_of(capture, calibration)
     if signal.shape[2] != system.own.shape[0]:
+        wholly = np.mod(there(calibration.windows).shape, system.pixel_shape) == 0
         raise InputError(
-            (f"holds windows of {signal.shape[2]} pixels, the system matrix {system.own.shape[0]}"),
+            f"holds windows of {signal.shape[2]} pixels, the system matrix {system.own.shape[0]}",
             where,
-            "simulate-pif with pixels_per_lenslet as measured",
+            "simulate-pif with pixels_per_lenslet as measured"
+            + (", or take --method weighted, which bins pixels" if wholly.all() else ""),
         )
     even = system.blocks.sum(axis=(0, 2), dtype=float)
     known = np.isfinite(signal) & np.isfinite(white)

@@ -23,6 +23,7 @@ from plenocli.inverse.picture.real_light import (
     transfer_noise,
     typical_white,
 )
+from plenocli.inverse.picture.superpixels import superpixels
 from tests.reference.calibrations import drawn_calibration, lenslet_grid
 
 PITCH, COUNT, WINDOW = 12.31, (9, 10), 12
@@ -124,6 +125,18 @@ def test_other_windows_are_refused(camera):
             calibration,
             None,
         )
+
+
+def test_matrices_of_a_whole_part_of_the_pixels_are_for_weighted(camera):
+    calibration, system, _ = camera
+    capture = Capture(mosaic=np.zeros(lenslets()[1]))
+    for side, named in ((WINDOW // 2, True), (5, False)):
+        binned = replace(
+            system, pixel_shape=(side, side), blocks=np.ones((1, side**2, 4)) / side**2
+        )
+        with pytest.raises(InputError, match="as measured") as refused:
+            superpixels(capture, binned, calibration)
+        assert ("--method weighted" in str(refused.value)) == named
 
 
 def test_splines_reach_between_pixels():

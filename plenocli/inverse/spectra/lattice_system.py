@@ -24,6 +24,8 @@ TILE = 24
 """Lenslets a side, without their PAD, that are solved at a time, at most."""
 IMPULSE = 16
 """Lenslets a side of the lattice on which what one pixel does to the answer is computed."""
+FREQUENCY = 2 * np.pi * np.fft.fftfreq(IMPULSE)
+"""Of that lattice, radians a lenslet."""
 STEPS = 12
 """Of a solution, at most: the border and lost pixels take more than one."""
 SETTLED, ENOUGH = 0.99, 0.05
@@ -308,6 +310,12 @@ class LatticeSystem:
         gain = _inverted(self._normal(acts, *frequencies)) @ acts.conj()
         return np.ascontiguousarray(gain.swapaxes(-1, -2), np.complex64)
 
+    @cached_property
+    def _sampled(self) -> tuple[np.ndarray, np.ndarray]:
+        """`_acts` and `_normal` at FREQUENCY."""
+        acts = self._acts(FREQUENCY, FREQUENCY)
+        return acts, self._normal(acts, FREQUENCY, FREQUENCY)
+
     def surprise(self, left: np.ndarray, scale: np.ndarray, b: np.ndarray) -> float:
         """-2 ln of the evidence a lenslet (but for what all systems of a capture share): what is
         left over of the data, how far the answer is from its prior, and how much of the prior the
@@ -319,18 +327,16 @@ class LatticeSystem:
         """
         from scipy.fft import irfft2, rfft2
 
-        frequency = 2 * np.pi * np.fft.fftfreq(IMPULSE)
         assert self.prior is not None
-        before = np.kron(self.prior.precision(frequency, frequency), self.prior.inverse)
-        acts = self._acts(frequency, frequency)
-        after = self._normal(acts, frequency, frequency)
-        ruled_out = np.linalg.slogdet(after)[1] - np.linalg.slogdet(before)[1]
+        bands = len(self.prior.mean)
+        before = bands * np.linalg.slogdet(self.prior.precision(FREQUENCY, FREQUENCY))[1]
+        before += self.unknowns // bands * np.linalg.slogdet(self.prior.inverse)[1]
+        ruled_out = np.linalg.slogdet(self._sampled[1])[1] - before
         apart = self.mirrored(b - self._even, PAD).astype(np.float32)
         spectrum = rfft2(apart, axes=(0, 1))
         rows, columns = apart.shape[:2]
         whole = 2 * np.pi * np.fft.fftfreq(rows), 2 * np.pi * np.fft.rfftfreq(columns)
         precision = self.prior.precision(*whole).astype(np.complex64)
-        bands = len(self.prior.mean)
         pulled = precision @ spectrum.reshape(*spectrum.shape[:2], -1, bands) @ self.prior.inverse
         pull = irfft2(pulled.reshape(spectrum.shape), s=(rows, columns), axes=(0, 1))
         inner = (slice(PAD, -PAD),) * 2
@@ -344,9 +350,7 @@ class LatticeSystem:
         Returns d (n, 2); h (n, band, pixel); and (band,) the variance that the prior leaves beside
         the noise of variance v.
         """
-        frequency = 2 * np.pi * np.fft.fftfreq(IMPULSE)
-        acts = self._acts(frequency, frequency)
-        normal = self._normal(acts, frequency, frequency)
+        acts, normal = self._sampled
         bands = self.unknowns // len(self.modes.kept)
         mean = np.kron(self.modes.mean[:, None], np.eye(bands))
         turned = np.linalg.solve(normal, np.broadcast_to(mean, (*normal.shape[:3], bands)))

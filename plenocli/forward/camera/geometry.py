@@ -29,6 +29,10 @@ if TYPE_CHECKING:
     from plenocli.forward.camera.model import Camera
 
 
+TILED = 1e-4
+"""Relative difference up to which a superpixel's pitch is a whole number of pixels."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Geometry:
     """Distances (m) and derived constants of a camera at one wavelength.
@@ -270,12 +274,16 @@ class Geometry:
         n: where the superpixel stands along the axis, in superpixel pitches.
 
         Returns m: zero where windows are centred on chief rays, on a sensor's raster at most half a
-        pixel.
+        pixel (and by how far superpixels of whole pixels are off that).
         """
         if self.pixel_shift is None:
             return 0.0
-        ideal = n * self.superpixel_pitch / self.pixel_pitch - self.pixel_shift[axis]
-        return (round(ideal) - ideal) * self.pixel_pitch
+        steps, shift = n * self.superpixel_pitch / self.pixel_pitch, self.pixel_shift[axis]
+        whole = round(steps)
+        if abs(steps - whole) > TILED * max(abs(whole), 1):
+            return (round(steps - shift) - (steps - shift)) * self.pixel_pitch
+        # whole pixels from superpixel to superpixel: all windows lie alike, at half a pixel, too
+        return (whole + round(-shift) - (steps - shift)) * self.pixel_pitch
 
     def mirrors(self, grid: tuple[int, int]) -> tuple[bool, bool, bool]:
         """Which mirror images map lattice, lenslets and pixels of superpixels onto themselves.

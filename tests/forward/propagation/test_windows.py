@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from plenocli.base.errors import NumericsError
+from plenocli.forward.accuracy.dial import pif_builder
 from plenocli.forward.camera.geometry import Geometry, geometry
 from tests.forward.propagation.cameras import WAVELENGTH, plan_pif, small_camera, system_matrix
 
@@ -64,3 +65,21 @@ def test_superpixels_together_hold_no_more_light_than_enters(model, monkeypatch)
     monkeypatch.setattr(Geometry, "parted", lambda self, grid: self)
     with pytest.raises(NumericsError, match="of its light on the sensor, but only"):
         system_matrix(WIDE, superpixels=(3, 3), coherent_ring=1, model=model, accuracy=1e-3)
+
+
+@pytest.mark.parametrize("shift", [(0.5, 0.3), (-0.5, 0.5), (0.5, -0.5)])
+@pytest.mark.parametrize("stretch", [1, 1.00005])
+def test_windows_that_lie_half_a_pixel_aside_still_tile(shift, stretch):
+    """Superpixels of whole pixels are a window apart, whichever way halves are rounded: the matrix
+    is continuous there, and no light counts twice.
+    """
+    camera = small_camera(sensor__pixel_pitch=2e-6 / stretch)
+    near = tuple(0.999 * s for s in shift)
+    at, beside = (
+        pif_builder(
+            camera.with_fit(s, 0.0), WAVELENGTH, superpixels=(3, 3), model="fresnel"
+        ).whole()
+        for s in (shift, near)
+    )
+    assert np.abs(at - beside).max() < 2e-3 * np.abs(at).max()
+    assert at.sum(axis=(0, 1)).max() <= 1.001

@@ -244,11 +244,12 @@ def test_a_look_that_leaves_pixels_out_explains_no_more(bench):
     assert not some.explains_more_than(every)
 
 
-def test_parts_of_a_pixel_cost_little(bench, solve, checkerboard):
+@pytest.mark.parametrize("shift", [(0.4, -0.25), (0.5, -0.25)])
+def test_parts_of_a_pixel_cost_little(bench, solve, checkerboard, shift):
     """Light of the neighbours' own superpixels enters through the rim."""
     camera, _, _, shoot = bench
     truth, shot = checkerboard
-    moved = shoot(Mosaic(camera.light.wavelengths, 5), seed=7, shift=(0.4, -0.25))
+    moved = shoot(Mosaic(camera.light.wavelengths, 5), seed=7, shift=shift)
     still, found = solve(shot), solve(moved)
     assert found.method == "coupled"
     assert errors(found, truth)[0] < 1.5 * errors(still, truth)[0]

@@ -279,11 +279,10 @@ class Geometry:
         if self.pixel_shift is None:
             return 0.0
         steps, shift = n * self.superpixel_pitch / self.pixel_pitch, self.pixel_shift[axis]
-        whole = round(steps)
-        if abs(steps - whole) > TILED * max(abs(whole), 1):
-            return (round(steps - shift) - (steps - shift)) * self.pixel_pitch
-        # whole pixels from superpixel to superpixel: all windows lie alike, at half a pixel, too
-        return (whole + round(-shift) - (steps - shift)) * self.pixel_pitch
+        window, whole = round(steps - shift), round(steps)
+        if abs(steps - whole) <= TILED * abs(whole):
+            window = whole + round(-shift)  # all windows lie alike, at half a pixel, too
+        return (window - (steps - shift)) * self.pixel_pitch
 
     def mirrors(self, grid: tuple[int, int]) -> tuple[bool, bool, bool]:
         """Which mirror images map lattice, lenslets and pixels of superpixels onto themselves.

@@ -30,6 +30,7 @@ from plenocli.base.errors import InputError, PlenoError
 from plenocli.base.text import utf8
 from plenocli.base.tiling import EVERYTHING, InParts
 from plenocli.files.artefacts import schema as tables
+from plenocli.files.artefacts.chunks import FILTERS, write_chunks
 from plenocli.files.artefacts.kinds import SCHEMAS
 from plenocli.files.artefacts.provenance import (
     Provenance,
@@ -329,7 +330,7 @@ def _frame(schema, data, apart, stored, descriptor=None):
             if isinstance(data[path], InParts):
                 _write_parts(file, schema, path, data[path])
             else:
-                file.create_dataset(path, data=data[path], **_storage(data[path]))
+                _write_array(file, path, data[path])
         for where in sorted(stored):
             target = file[where or "/"]
             for name, value in stored[where].items():
@@ -339,17 +340,32 @@ def _frame(schema, data, apart, stored, descriptor=None):
     return memory, offsets
 
 
+def _write_array(file, path, values):
+    storage = _storage(values)
+    if "chunks" not in storage:
+        file.create_dataset(path, data=values, **storage)
+    else:
+        made = file.create_dataset(path, shape=values.shape, dtype=values.dtype, **storage)
+        write_chunks(made, (0,) * values.ndim, values)
+
+
 def _write_parts(file, schema, path, values):
     """Write a dataset part by part, whole chunks at a time."""
-    made = file.create_dataset(path, shape=values.shape, dtype=values.dtype, **_storage(values))
-    rows = values.shape[-2]
-    step, at, held = made.chunks[-2], 0, []
+    shape = values.shape
+    made = file.create_dataset(path, shape=shape, dtype=values.dtype, **_storage(values))
+    # chunks are parts of axis `axis`, whole beyond it and one index thick before it
+    axis = next((k for k, side in enumerate(made.chunks[:-2]) if side > 1), len(shape) - 2)
+    inner = math.prod(shape[axis + 1 : -1])
+    rows, step, at, held = shape[axis] * inner, made.chunks[axis] * inner, 0, []
     fields = replace(schema, rules=())
 
     def put(block):
-        plane, row = divmod(at, rows)
-        index = () if len(values.shape) == 2 else np.unravel_index(plane, values.shape[:-2])
-        made[(*index, slice(row, row + len(block)))] = block
+        before, row = divmod(at, rows)
+        corner = (
+            (*np.unravel_index(before, shape[:axis]), row // inner) if axis else (row // inner,)
+        )
+        block = block.reshape((1,) * axis + (-1,) + shape[axis + 1 :])
+        write_chunks(made, corner + (0,) * (len(shape) - axis - 1), block)
 
     for part in values.parts():
         part = np.ascontiguousarray(part, values.dtype)
@@ -364,7 +380,7 @@ def _write_parts(file, schema, path, values):
             block = held[0] if len(held) == 1 else np.concatenate(held)
             put(block[:ready])
             at, held = at + ready, [block[ready:]] if ready < waiting else []
-    if at != np.prod(values.shape[:-1]):
+    if at != np.prod(shape[:-1]):
         raise ValueError(f"'{path}' lacks rows")
 
 
@@ -424,14 +440,7 @@ def _storage(values: np.ndarray | InParts) -> dict[str, Any]:
     for size in reversed(values.shape):
         chunks.insert(0, max(min(size, room), 1))
         room //= chunks[0]
-    return {
-        "chunks": tuple(chunks),
-        "fletcher32": True,
-        "track_times": False,
-        "compression": "gzip",
-        "compression_opts": 1,
-        "shuffle": True,
-    }
+    return {"chunks": tuple(chunks), "track_times": False, **FILTERS}
 
 
 # --- reading --------------------------------------------------------------------------------------

@@ -182,6 +182,10 @@ class Whole:
         known = {name: dict(of) for name, of in self.found.items() if name not in MEANS}
         return Whole(known, only_means=True)
 
+    def means(self) -> Whole:
+        """What others need of it for theirs."""
+        return Whole({name: self.found[name] for name in MEANS if name in self.found})
+
     def closed_with(self, others: Sequence[Whole]) -> Whole:
         """With the means over other pieces in place of what the one piece found."""
         found = {name: dict(of) for name, of in self.found.items()}

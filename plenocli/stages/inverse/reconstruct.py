@@ -626,7 +626,7 @@ class _TileTask:
         """What a piece adds to the means over pieces."""
         own = self.whole.for_means()
         self._estimated(piece, own)
-        return own
+        return own.means()
 
     def __call__(self, job: tuple[int, Tile]) -> SolvedTile:
         """A tile."""

@@ -16,7 +16,7 @@ import numpy as np
 from plenocli import __version__
 from plenocli.base.errors import OutputError, PlenoError
 from plenocli.base.progress import bar
-from plenocli.base.tiling import InParts, to_plane
+from plenocli.base.tiling import InParts, bands, to_plane
 from plenocli.execution.pool import Pool, run_all
 from plenocli.files.kept import read_arrays, write_arrays
 from plenocli.inverse.picture.reconstruction import Entry, Stats
@@ -107,10 +107,11 @@ class PlaneOfTiles:
             rows.setdefault(tile.own[0].start, []).append(number)
         size = self.shape[0] * self.shape[1]
         for band in range(self.bands):
-            part = slice(band * size, (band + 1) * size)
+            points = slice(band * size, (band + 1) * size)
             for numbers in rows.values():
-                planes = [to_plane(self._read(n)[:, :, part], self.shape) for n in numbers]
-                yield np.concatenate(planes, axis=1)
+                planes = [to_plane(self._read(n)[:, :, points], self.shape) for n in numbers]
+                for part in bands(len(planes[0]), self.shape[0]):
+                    yield np.concatenate([plane[part] for plane in planes], axis=1)
 
     def _read(self, number: int) -> np.ndarray:
         arrays = read_arrays(self.bench.path(number))

@@ -89,7 +89,8 @@ class Method(ABC):
     each_pixel: whether every pixel counts by its own noise.
     in_batches: whether its lenslets are solved in batches, which processes may share.
     in_tiles: whether large captures may be estimated tile by tile.
-    weighs_all: whether one weight goes by the power of all lenslets, which some do not tell.
+    weighs_all: whether one weight goes by the power, or the error, of all lenslets, which some do
+        not tell.
     points_around: of a method that sees the whole picture, how far a point looks.
     unrestrained: whether a picture that explains its capture may be noise for the most part.
     """

@@ -101,7 +101,8 @@ def _from_lmmse(
         x[inner], sigma[inner] = around[0][inner], around[1][inner]
     else:
         x[inner], sigma[inner] = adaptive_lmmse(estimators, light.data, y[inner])
-    error = float(np.sqrt(light.data.common("start", lambda: np.mean(sigma[inner] ** 2))))
+    counted = sigma[inner].reshape(-1, sigma.shape[2])[light.counted]
+    error = float(np.sqrt(light.data.common("start", lambda: np.mean(counted**2))))
     found, rule, rounds = x.copy(), "", 0
     if not (light.data.whole and light.data.whole.only_means):
         reach, held = -(-LOOK // min(shape)), None
@@ -127,6 +128,7 @@ TV = Estimator(
     name="tv",
     sees=Sees.PICTURE,
     phases=footprint.tv_phases,
+    weighs_all=True,
     points_around=LOOK,
     estimate=partial(_from_lmmse, total_variation, False, error_bars.BY_VARIATION),
 )
@@ -134,6 +136,7 @@ PNP = Estimator(
     name="pnp",
     sees=Sees.PICTURE,
     phases=footprint.pnp_phases,
+    weighs_all=True,
     points_around=LOOK,
     estimate=partial(_from_lmmse, plug_and_play, True, error_bars.BY_MATCHING),
 )

@@ -16,7 +16,7 @@ import numpy as np
 from plenocli.base.tiling import to_plane
 from plenocli.inverse.picture.estimators import Estimators
 from plenocli.inverse.picture.lenslet_model import Common, Superpixels
-from plenocli.inverse.picture.solvers.lmmse import SCALES, Lmmse
+from plenocli.inverse.picture.solvers.lmmse import SCALES, Lmmse, mean_scale
 
 INTERVAL, INSIDE = 1.96, 0.95
 """The interval is INTERVAL standard deviations each way, and holds the truth with INSIDE."""
@@ -75,7 +75,7 @@ def posterior(
     signals = y.reshape(rows * columns, -1).T
     w = lmmse.coordinates(signals)
     contrast = lmmse.contrast(w, common)
-    scale = np.exp(np.log(SCALES) @ contrast)
+    scale = mean_scale(contrast)
     x, sigma = (
         found.T.reshape(rows, columns, -1)
         for found in (lmmse.apply(signals, scale, w), spread(lmmse, w, contrast))

@@ -32,6 +32,13 @@ belongs to the field.
 """
 
 
+def mean_scale(probability: np.ndarray) -> np.ndarray:
+    """(signal,) the mean of the logarithm of each one's scale, as a scale; probability: (scale,
+    signal) of each of SCALES.
+    """
+    return np.exp(np.log(SCALES) @ probability)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Lmmse:
     """Everything that `prepare` works out once. Points of several bands stand one band after the
@@ -84,7 +91,7 @@ class Lmmse:
         estimates and their predicted standard deviations (point, signal), the scales (signal,).
         """
         w = self.coordinates(y)
-        scale = np.exp(np.log(SCALES) @ self.contrast(w, common))
+        scale = mean_scale(self.contrast(w, common))
         left = self.gain**2 @ (1 / (self.power[:, None] + self.noise[:, None] / scale))
         left = scale * np.maximum(self.variance[:, None] - left, 0)
         # the patterns are orthogonal
@@ -124,7 +131,7 @@ class Lmmse:
 
         Returns (signal,).
         """
-        return np.exp(np.log(SCALES) @ self.contrast(self.coordinates(y), common))
+        return mean_scale(self.contrast(self.coordinates(y), common))
 
     def contrast(self, w: np.ndarray, common: Common = alone) -> np.ndarray:
         """Probability of each of SCALES, (scale, signal), for each signal.

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from plenocli.inverse.picture.solvers.lmmse import SCALES, Lmmse
+from plenocli.inverse.picture.solvers.lmmse import SCALES, Lmmse, mean_scale
 
 STRONG = 20
 """Strongest coordinates, which tell the lenslets' contrast before anything is known of excess."""
@@ -80,7 +80,7 @@ def _contrasts(power: np.ndarray, noise: np.ndarray, w: np.ndarray) -> np.ndarra
         posterior = likelihood * prior[:, None]
         posterior /= posterior.sum(axis=0)
         prior = np.maximum(posterior.mean(axis=1), 1e-12)
-    return np.exp(np.log(SCALES) @ posterior)
+    return mean_scale(posterior)
 
 
 def _running_mean(values: np.ndarray) -> np.ndarray:

@@ -105,7 +105,9 @@ def _through(values: np.ndarray, matrix: np.ndarray) -> np.ndarray:
     """Values (row, column, n) times a matrix (n, m), in one product: one for each row reads the
     matrix anew, which takes four times as long.
     """
-    return (values.reshape(-1, values.shape[2]) @ matrix).reshape(*values.shape[:2], -1)
+    rows, columns, size = values.shape
+    flat = values.reshape(rows * columns, size) @ matrix
+    return flat.reshape(rows, columns, matrix.shape[1])
 
 
 class BlockCirculant:

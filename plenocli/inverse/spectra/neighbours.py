@@ -4,6 +4,7 @@ of the camera, scaled to the response that was measured. docs/model.md, section 
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -98,8 +99,10 @@ class NeighbourLight:
             return self
         fitted = self.camera.fitted
         row, column = (np.zeros(2) if fitted is None else np.array(fitted.pixel_shift)) - shift
-        there = self.camera.with_fit((float(row), float(column)), 0.0)
-        offsets, light = _predicted(there, calibration, self.modes)
+        # what a description holds is at most half a pixel
+        down, right = (int(np.sign(n)) if abs(n) > 0.5 else 0 for n in (row, column))
+        there = self.camera.with_fit((float(row - down), float(column - right)), 0.0)
+        offsets, light = _predicted(there, calibration, self.modes, (down, right))
         kept = (offsets[:, None] == self.offsets).all(axis=-1).any(axis=1)
         offsets, light = offsets[kept], light[kept]
         changes = np.concatenate([_sizes(offsets, light), self.changes[RINGS:]])
@@ -215,12 +218,16 @@ def _as_measured(camera: Camera, calibration: Calibration) -> Camera:
 
 
 def _predicted(
-    camera: Camera, calibration: Calibration, modes: FieldModes | None = None
+    camera: Camera,
+    calibration: Calibration,
+    modes: FieldModes | None = None,
+    whole: tuple[int, int] = (0, 0),
 ) -> tuple[np.ndarray, np.ndarray]:
     """(offsets, light) of NeighbourLight for all superpixels that are followed, as bright in each
     band as the calibrated response: by as many object points as a field has diffraction cells,
     since fewer leave fringes, and too little light on neighbours. Of the points of a field, row by
-    row, where there are no modes.
+    row, where there are no modes. On pixels that lie `whole` (rows, columns) further than the
+    camera says.
     """
     from plenocli.forward.propagation.system_matrix import PifBuilder
 
@@ -231,11 +238,35 @@ def _predicted(
         offsets = builder.offsets
         found = _by_part(builder.whole(), sampled)
         bands.append((found if modes is None else found @ modes.basis).astype(np.float32))
-    light = np.stack(bands, axis=-1) * _colours(camera, calibration)[:, None].astype(np.float32)
+    shape = there(calibration.windows).shape
+    light = _further(np.stack(bands, axis=-1), offsets, whole, shape) * _colours(
+        camera, calibration
+    )[:, None].astype(np.float32)
     even = np.ones(POINTS**2) if modes is None else modes.even
     known = np.einsum("opmk,m,pk->k", light, even, np.isfinite(measured))
     light *= np.nansum(measured, axis=0) / np.maximum(known, 1e-300)
     return offsets, _mixed(light, calibration)
+
+
+def _further(
+    light: np.ndarray, offsets: np.ndarray, whole: tuple[int, int], shape: tuple[int, int]
+) -> np.ndarray:
+    """Light (superpixel, pixel, ...) on the pixels that lie `whole` (rows, columns) further: beyond
+    a window of `shape` pixels on those of the next one, and none beyond the last.
+    """
+    if not any(whole):
+        return light
+    image = light.reshape(len(offsets), *shape, *light.shape[2:])
+    place = {tuple(offset): k for k, offset in enumerate(offsets.tolist())}
+    rows, columns = (np.divmod(np.arange(n) + step, n) for n, step in zip(shape, whole))
+    out = np.zeros_like(image)
+    for (row, column), k in place.items():
+        for down, right in itertools.product(np.unique(rows[0]), np.unique(columns[0])):
+            seen = place.get((row + int(down), column + int(right)))
+            if seen is not None:
+                to = np.ix_(rows[0] == down, columns[0] == right)
+                out[k][to] = image[seen][np.ix_(rows[1], columns[1])][to]
+    return out.reshape(light.shape)
 
 
 def _planned(camera: Camera, calibration: Calibration) -> Iterator[tuple[float, Camera, PifPlan]]:

@@ -280,3 +280,18 @@ def test_without_noise_figures_pixels_are_not_weighed(bench, checkerboard):
     shot = replace(shot, noise=None, levels=replace(shot.levels, gain=None))
     with pytest.raises(NumericsError, match="not known"):
         Demultiplexer(blind, method="coupled", camera=camera).estimate(shot, "x")
+
+
+def test_light_that_moved_by_more_than_half_a_pixel_goes_on_as_below_it(bench):
+    """By a camera whose own pixels are shifted, which says no more than half a pixel."""
+    camera, calibration, _, _ = bench
+    found = neighbours.neighbour_light(camera, calibration)
+    shifted = replace(found, camera=camera.with_fit((0.4, -0.45), 0.0))
+    below, above, further = (
+        shifted.moved(np.array([0.4 - down, down - 0.45]), calibration).light
+        for down in (0.48, 0.52, 0.56)
+    )
+    step, next_step = (
+        np.abs(b - a).sum(axis=(1, 2, 3)) for a, b in ((below, above), (above, further))
+    )
+    assert (step < 1.3 * next_step).all() and (next_step < 1.3 * step).all()

@@ -9,12 +9,18 @@ from __future__ import annotations
 
 import contextlib
 import os
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from plenocli.base.errors import InputError, NumericsError
 from plenocli.base.memory import size_text
+
+if TYPE_CHECKING:
+    from threadpoolctl import ThreadpoolController
 
 EXPANSION = 1 << 15
 """Times its own size that a whole file can declare: deflate packs 1032 bytes into one, and a pixel
@@ -127,11 +133,25 @@ def within(new: Budget | None = None) -> Iterator[None]:
 
 def one_thread() -> contextlib.AbstractContextManager:
     """A context in which products and decompositions of matrices stay on the thread that asks for
-    them: idle threads that wait for the next product cost many times its processor time.
+    them: idle threads that wait for the next product cost many times its processor time. It holds
+    from where it is asked for.
     """
-    from threadpoolctl import threadpool_limits
+    return linear_algebra().limit(limits=1, user_api="blas")
 
-    return threadpool_limits(1, "blas")
+
+def linear_algebra() -> ThreadpoolController:
+    """The libraries of linear algebra that are loaded. They are looked for again where a module
+    has been imported since, which is how they come: to look takes milliseconds, and a sweep of
+    small cameras asks hundreds of times a second.
+    """
+    return _libraries(len(sys.modules))
+
+
+@lru_cache(maxsize=1)
+def _libraries(modules: int) -> ThreadpoolController:
+    from threadpoolctl import ThreadpoolController
+
+    return ThreadpoolController()
 
 
 def spread(parts: Sequence[tuple], work: Callable[..., object]) -> None:

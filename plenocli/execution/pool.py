@@ -32,7 +32,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from plenocli import __version__
-from plenocli.base.budget import Budget, budget, set_budget
+from plenocli.base.budget import Budget, budget, one_thread, set_budget
 from plenocli.base.errors import OutputError, PlenoError, UsageError
 from plenocli.base.progress import collected_notes, note
 from plenocli.base.text import how_to_install
@@ -41,6 +41,8 @@ Job = tuple[Any, Callable[[Any], Any], Any]
 """(token, function, task): the result of function(task) comes back with its token."""
 ATTEMPTS = 2
 """Times that a task may take its process along before it is given up."""
+PATIENCE = "10s"
+"""How long a Dask scheduler may take to answer."""
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -117,10 +119,8 @@ def run_all(pool: Pool, jobs: Iterable[Job]) -> Iterator[tuple[Any, Any]]:
 
 @contextlib.contextmanager
 def _one_thread() -> Iterator[None]:
-    from threadpoolctl import threadpool_limits
-
     # SciPy has a library of its own, which the limit does not reach where it is loaded later
-    with threadpool_limits(1, "blas"), _environment(_THREADS[1:]):
+    with one_thread(), _environment(_THREADS[1:]):
         yield
 
 
@@ -151,10 +151,9 @@ def _remotely(
             fix="install one version everywhere",
         ), []
     import scipy.linalg.blas  # noqa: F401
-    from threadpoolctl import threadpool_limits
 
     # both for good: other tasks may run beside this one
-    threadpool_limits(1, "blas")
+    one_thread()
     set_budget(replace(granted, threads=1))
     with collected_notes() as said:
         return attempt(function, task), said
@@ -397,7 +396,7 @@ def _cluster(scheduler: str) -> Iterator[Any]:
         logging.getLogger(name).setLevel(logging.CRITICAL)
     address, security = _address(scheduler)
     try:
-        client = Client(address, timeout="10s", security=security, set_as_default=False)
+        client = Client(address, timeout=PATIENCE, security=security, set_as_default=False)
     except (OSError, ValueError, TimeoutError) as error:
         raise UsageError(
             f"no Dask scheduler answers at {scheduler} ({type(error).__name__})",

@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from plenocli import __version__
+from plenocli.base.budget import linear_algebra
 from plenocli.base.errors import PlenoError
 from plenocli.files.atomic import publish
 
@@ -73,9 +74,7 @@ def write_arrays(path: Path, arrays: tuple[np.ndarray, ...]) -> None:
 
 
 def _digest(name: str, inputs: list[np.ndarray]) -> str:
-    from threadpoolctl import threadpool_info
-
-    loaded = [library for library in threadpool_info() if library["user_api"] == "blas"]
+    loaded = [library for library in linear_algebra().info() if library["user_api"] == "blas"]
     own = [library for library in loaded if "numpy" in library["filepath"]] or loaded
     machine = [{**library, "filepath": ""} for library in own]
     digest = hashlib.sha256(

@@ -15,6 +15,7 @@ import pytest
 from plenocli.base.budget import Budget, within
 from plenocli.base.errors import InputError, UsageError
 from plenocli.base.progress import collected_notes, note
+from plenocli.execution import pool as pools
 from plenocli.execution.pool import Lost, open_pool, run_all
 
 HERE = "tests_scheduler_tasks"  # a module that processes find by its name
@@ -126,6 +127,25 @@ def test_a_library_that_is_loaded_by_a_task_has_one_thread():
         [sys.executable, "-c", code], env=os.environ | threads, capture_output=True, text=True
     )
     assert done.stdout.split() == ["True", "1"], done.stderr
+
+
+def test_a_library_that_came_since_it_was_looked_for_has_one_thread():
+    code = (
+        "import numpy\n"
+        "from threadpoolctl import threadpool_info\n"
+        "from plenocli.base.budget import one_thread\n"
+        "import sys; assert 'scipy' not in sys.modules\n"
+        "with one_thread(): pass\n"
+        "import scipy.linalg\n"
+        "blas = lambda: [i['num_threads'] for i in threadpool_info() if i['user_api'] == 'blas']\n"
+        "with one_thread(): inside = blas()\n"
+        "print(len(inside) > 1, max(inside), *set(blas()))"
+    )
+    threads = {"OMP_NUM_THREADS": "2", "OPENBLAS_NUM_THREADS": "2"}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=os.environ | threads, capture_output=True, text=True
+    )
+    assert done.stdout.split() == ["True", "1", "2"], done.stderr
 
 
 def test_a_process_that_dies_takes_no_result_along(tasks, tmp_path):
@@ -245,8 +265,9 @@ def test_a_scheduler_that_goes_while_tasks_are_given_up_is_no_bug(monkeypatch):
 
 
 @pytest.mark.parametrize("address", ["nowhere", "tcp://127.0.0.1:1"])
-def test_a_cluster_that_is_not_there_is_a_usage_error(address):
+def test_a_cluster_that_is_not_there_is_a_usage_error(address, monkeypatch):
     pytest.importorskip("distributed")
+    monkeypatch.setattr(pools, "PATIENCE", "1s")
     with pytest.raises(UsageError, match="scheduler"), open_pool(1, address):
         pass
 

@@ -10,6 +10,8 @@ from functools import lru_cache
 
 import numpy as np
 
+from plenocli.base.budget import one_thread
+
 
 @lru_cache(maxsize=2)
 def product_rate(double: bool) -> float:
@@ -19,13 +21,11 @@ def product_rate(double: bool) -> float:
 
     Returns real operations a second, 8 for a complex multiply-add.
     """
-    from threadpoolctl import threadpool_limits
-
     dtype = np.complex128 if double else np.complex64
     a, b = np.ones((512, 72), dtype), np.ones((72, 512), dtype)
     out = np.empty((512, 512), dtype)
     best = np.inf
-    with threadpool_limits(1, "blas"):
+    with one_thread():
         for _ in range(6):
             start = time.process_time()
             np.matmul(a, b, out=out)

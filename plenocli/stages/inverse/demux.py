@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from plenocli.base.budget import one_thread
 from plenocli.base.errors import InputError, NumericsError
 from plenocli.base.progress import note
 from plenocli.base.text import Record
@@ -128,7 +129,6 @@ def run_demux(
     """
     # a library of its own, which the limit below reaches only once it is loaded
     import scipy.linalg.blas  # noqa: F401
-    from threadpoolctl import threadpool_limits
 
     others = [calibration, settings.reference, settings.camera, settings.prior]
     captures = named_captures(captures, others)
@@ -141,7 +141,7 @@ def run_demux(
         inputs=[*captures, *others],
     )
     # captures are what runs side by side, and the bytes must not depend on how many
-    with threadpool_limits(1, "blas"):
+    with one_thread():
         # a broken calibration ends the run here, before any capture
         job = (
             CaptureDemultiplexer(

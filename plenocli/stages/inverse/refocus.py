@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from plenocli.base.budget import one_thread
 from plenocli.base.errors import UsageError
 from plenocli.base.text import Record
 from plenocli.execution.batch import outcomes, plan_batch, summarise
@@ -94,8 +95,6 @@ def run_refocus(
     Raises UsageError, InputError, OutputError; at the end, with the exit code of the worst, where
     some of several failed.
     """
-    from threadpoolctl import threadpool_limits
-
     from plenocli.files.read.captures import named_captures
     from plenocli.files.results.lightfields import SUFFIXES
 
@@ -117,7 +116,7 @@ def run_refocus(
     work = partial(_refocused, settings=settings, optics=optics, tried=tried)
     write = partial(_write, settings=settings, overwrite=overwrite, command=command)
     with (
-        threadpool_limits(1, "blas"),
+        one_thread(),
         open_pool(min(workers, len(batch.todo)), None, threads=True) as pool,
     ):
         return summarise(batch, outcomes(batch, pool, work, write))

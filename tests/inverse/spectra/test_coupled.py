@@ -8,7 +8,7 @@ from plenocli.inverse.spectra import lattice_system
 from plenocli.inverse.spectra.coupled import PART, STEPPED, LatticeCapture, coupled, fine, likeliest
 from plenocli.inverse.spectra.field_modes import FieldModes, field_modes
 from plenocli.inverse.spectra.lattice_system import UNTOLD, LatticeSystem, PointPrior
-from plenocli.inverse.spectra.neighbours import NeighbourLight
+from plenocli.inverse.spectra.neighbours import NeighbourLight, _further
 
 BANDS, SIDE, POINTS = 2, 6, 3
 PIXELS = SIDE**2
@@ -373,3 +373,20 @@ def test_blocks_keep_the_measured_sum():
     for change in light.coupled_changes():
         np.testing.assert_allclose(change.sum(axis=0), 0, atol=1e-9)
     assert light.moved(np.zeros(2), calibration=None) is light
+
+
+@pytest.mark.parametrize("whole", [(0, 0), (1, 0), (0, -1), (-1, 1), (1, 1)])
+def test_light_on_pixels_further_is_that_of_a_plane_cut_further(whole):
+    """Windows tile a plane, beyond which is nothing; superpixels need not be in order."""
+    rows, columns = 4, 5
+    light = np.random.default_rng(7).random((9, rows * columns, 2, 3))
+    order = np.random.default_rng(8).permutation(9)
+    plane = np.zeros((5 * rows, 5 * columns, 2, 3))
+    for (i, j), own in zip(OFFSETS, light):
+        top, left = (2 + i) * rows, (2 + j) * columns
+        plane[top : top + rows, left : left + columns] = own.reshape(rows, columns, 2, 3)
+    found = _further(light[order], OFFSETS[order], whole, (rows, columns))
+    for (i, j), own in zip(OFFSETS[order], found):
+        top, left = (2 + i) * rows + whole[0], (2 + j) * columns + whole[1]
+        wanted = plane[top : top + rows, left : left + columns]
+        assert np.array_equal(own.reshape(rows, columns, 2, 3), wanted)

@@ -282,6 +282,7 @@ def test_without_noise_figures_pixels_are_not_weighed(bench, checkerboard):
         Demultiplexer(blind, method="coupled", camera=camera).estimate(shot, "x")
 
 
+@pytest.mark.slow
 def test_light_that_moved_by_more_than_half_a_pixel_goes_on_as_below_it(bench):
     """By a camera whose own pixels are shifted, which says no more than half a pixel."""
     camera, calibration, _, _ = bench

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -401,12 +401,14 @@ def _grid(
     signal: of the white image, or those of several captures of scenes.
     """
     parts = camera is not None and camera.filter_array is not None
+    pitch = camera.superpixel_pitch / camera.sensor.pixel_pitch if camera and parts else None
     said = camera.lenslet_array.count if camera is not None else None
     count = said or (white.grid.count if white.grid else None)
     try:
         if not isinstance(signal, np.ndarray):
             return find_scene_grid(signal, white.cfa, lattice, near, parts=parts, count=count)
-        return find_grid(_filled(signal), white.cfa, None, lattice, near, parts=parts, count=count)
+        known: Any = {"parts": parts, "count": count, "pitch": pitch}
+        return find_grid(_filled(signal), white.cfa, None, lattice, near, **known)
     except (NumericsError, InputError) as error:
         raise error.at(white.metadata.path) from None
 

@@ -26,8 +26,16 @@ STRUCTURED = 0.2
 """Correlation half a step away, over that of a whole step, above which superpixels hold several
 bright parts.
 """
+NEARLY = 0.15
+"""Of the pitch that is known about, by which it may be off."""
 LONGEST_SIDE = 1.3
 """Of a cell's shorter side, that its longer one may be."""
+STRONG = 0.6
+"""Correlation, less than that of spots that repeat all over an image, 0.7 to 0.8; thin lines have
+0.3 to 0.6.
+"""
+FAINT = 0.04
+"""Of the typical light of a lenslet, below which a spot is noise of dark surroundings."""
 SCATTER = 0.07
 """Of the pitch, by which spots may scatter (rms) about the best grid."""
 BORDER_WEIGHT = 0.1
@@ -66,6 +74,7 @@ def find_grid(
     *,
     parts: bool = False,
     count: Sequence[int] | None = None,
+    pitch: float | None = None,
     scene: Periodicity | None = None,
 ) -> LensletGrid:
     """Find the lenslet grid of a white image.
@@ -83,6 +92,7 @@ def find_grid(
         array do: one that is much brighter than the others passes for all of the superpixel.
     count: lenslets (rows, columns), where they are known: of several phases that of this count is
         taken.
+    pitch: px between superpixels, where it is known about: parts that look alike repeat oftener.
     scene: how the image repeats if it is no white one but captures of a scene, evened
         (plenocli.inverse.grid.scenes); then the error that is expected is found, too.
 
@@ -94,13 +104,18 @@ def find_grid(
     mosaic = prepare(white, cfa, dark)
     # what is left of the 2x2 pattern goes
     image = mosaic if cfa == "mono" else template.smoothed(mosaic)
-    period = scene or lattice.find_basis(brightest_crop(image, crop))
-    basis, kind, several = _basis(period, lattice_kind)
-    structured = several or parts
-    pitch = float(np.hypot(*basis.T).min())
-    index, position, clean, slope = _measured_sites(
-        image, basis, kind, pitch, structured, even=scene is None
+    period = scene or _period(image, crop)
+    basis, kind, several, times = _basis(period, lattice_kind, pitch)
+    alike = max(times) > 1
+    structured = several or parts or alike
+    cell = basis * times[:, None]
+    pitch = float(np.hypot(*cell.T).min())
+    index, position, clean, slope = (
+        _parts_sites(image, basis, times, even=scene is None)
+        if alike
+        else _measured_sites(image, basis, kind, pitch, structured, even=scene is None)
     )
+    basis = cell
     inside = _whole(position, image.shape, 0.5 * pitch) & clean
     model, weight = _first_model(index, position, inside, kind, pitch, even=scene is None)
     error = None
@@ -197,15 +212,22 @@ def _check_near(model: GridModel, near: Sequence[float], pitch: float) -> None:
         )
 
 
-def _basis(found: Periodicity, lattice_kind: str) -> tuple[np.ndarray, str, bool]:
-    """(lattice vectors [down, right], kind of lattice, whether superpixels hold several bright
-    parts).
+def _basis(
+    found: Periodicity, lattice_kind: str, pitch: float | None
+) -> tuple[np.ndarray, str, bool, np.ndarray]:
+    """(lattice vectors [down, right] of what repeats, kind of lattice, whether it holds several
+    bright parts, how many (down, right) make a superpixel); pitch: px, as of find_grid.
     """
     if found.basis is None:
         raise NumericsError(f"no lenslet lattice in the image: {found.reason}", fix=FIX)
     kind = lattice.kind_of(found.basis) if lattice_kind == "auto" else lattice_kind
     basis = lattice.oriented(found.basis, kind)
     sides = np.hypot(*basis.T)
+    times = np.ones(2, int)
+    if pitch is not None:
+        times = np.maximum(np.rint(pitch / sides), 1).astype(int)
+        times[np.abs(times * sides / pitch - 1) > NEARLY] = 1
+    sides = sides * times
     if sides.max() > LONGEST_SIDE * sides.min():
         raise NumericsError(
             (
@@ -214,7 +236,7 @@ def _basis(found: Periodicity, lattice_kind: str) -> tuple[np.ndarray, str, bool
             ),
             fix=FIX,
         )
-    return basis, kind, found.structure > STRUCTURED
+    return basis, kind, found.structure > STRUCTURED, times
 
 
 def _first_model(
@@ -305,6 +327,32 @@ def _replace_dead(image: np.ndarray, step: int) -> np.ndarray:
     return out
 
 
+def _period(image: np.ndarray, crop: int) -> Periodicity:
+    """How a white image repeats in its brightest part. Where it does so weakly, dark surroundings
+    of the array may hide thin lines: then in what is lit alone, or in the middle of that.
+    """
+    found = [lattice.find_basis(brightest_crop(image, crop))]
+    if found[0].strength < STRONG:
+        parts = (_lit_part(image, share) for share in (1.0, 0.7))
+        found += [lattice.find_basis(brightest_crop(part, crop)) for part in parts]
+    best = max(one.strength for one in found)
+    return next(one for one in found if one.strength >= 0.9 * best)
+
+
+def _lit_part(image: np.ndarray, share: float) -> np.ndarray:
+    """The rows and columns that have at least half of the light of the brightest ones, `share` of
+    them in the middle.
+    """
+    sides = []
+    for axis in (0, 1):
+        light = image.mean(axis=1 - axis)
+        lit = np.flatnonzero(light > 0.5 * np.quantile(light, 0.95))
+        first, last = (lit[0], lit[-1] + 1) if len(lit) else (0, len(light))
+        cut = int((1 - share) / 2 * (last - first))
+        sides.append(slice(first + cut, last - cut))
+    return image[tuple(sides)]
+
+
 def brightest_crop(image: np.ndarray, most: int) -> np.ndarray:
     """Up to `most` px a side around the centroid of the light."""
     clipped = np.clip(image[::4, ::4], 0, None).astype(float)
@@ -345,6 +393,8 @@ def _measured_sites(
             fix=FIX,
         )
     position, flux = spots.windowed_centroids(image, maxima, pitch, iterations=2, window=window)
+    lit = flux > FAINT * _typical(flux)
+    position, flux = position[lit], flux[lit]
     middle = np.array(image.shape) / 2
     bright = np.flatnonzero(flux > 0.5 * np.median(flux))
     starts = bright[np.argsort(((position[bright] - middle) ** 2).sum(axis=1))]
@@ -374,6 +424,37 @@ def _measured_sites(
             fix=FIX,
         )
     return index, first, level > 0.3, slope
+
+
+def _parts_sites(
+    image: np.ndarray, basis: np.ndarray, times: np.ndarray, *, even: bool
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """As _measured_sites, of superpixels whose parts look alike: the first part of each, found
+    where their lattice is square.
+
+    basis: vectors [down, right] from part to part, of which `times` make a superpixel.
+    """
+    from scipy import ndimage
+
+    side = float(np.hypot(*basis.T).min())
+    to_image = basis / side
+    corners = np.array(list(np.ndindex(2, 2))) * image.shape @ np.linalg.inv(to_image)
+    low, high = np.floor(corners.min(axis=0)), np.ceil(corners.max(axis=0))
+    square = ndimage.affine_transform(
+        image, to_image.T, low @ to_image, tuple((high - low).astype(int)), order=1
+    )
+    index, position, clean, slope = _measured_sites(
+        square, side * np.eye(2), "square", side, False, even=even
+    )
+    first = (index % times == 0).all(axis=1)
+    position = (position[first] + low) @ to_image
+    slope = slope[first] @ np.linalg.inv(to_image).T
+    return index[first] // times, position, clean[first], slope
+
+
+def _typical(light: np.ndarray) -> float:
+    """Median of what is not dark, as most of a frame may be beside a small array."""
+    return float(np.median(light[light > 0.1 * np.quantile(light, 0.98)])) if light.size else 0.0
 
 
 def _illumination(
@@ -430,14 +511,13 @@ def _to_dark_borders(
             moved = replace(model, shift=model.shift - np.array([down, right]))
             cells = _cells(moved, image.shape)
             whole = _whole(moved.at(cells), image.shape, 0.5 * pitch)
-            shape = [int(whole.any(axis=axis).sum()) for axis in (1, 0)]
-            hint = (
-                -float(np.hypot(*(moved.at(np.rint(_index_at(moved, near))) - near)))
-                if near is not None
-                else -float(np.abs(np.subtract(shape, count)).sum())
-                if count is not None
-                else 0.0
-            )
+            hint = 0.0
+            if near is not None:
+                hint = -float(np.hypot(*(moved.at(np.rint(_index_at(moved, near))) - near)))
+            elif count is not None:
+                lit = _lit_cells(image, moved)
+                shape = np.ptp(lit, axis=0) + 1 if len(lit) else (0, 0)
+                hint = -float(np.abs(np.subtract(shape, count)).sum())
             found.append(((hint, int(whole.sum())), depth_down + depth_right, moved))
     if not found:
         return model
@@ -520,8 +600,11 @@ def _line(along: np.ndarray, profile: np.ndarray, start: float, reach: float) ->
     away = (along - start + 0.5) % 1 - 0.5
     close = np.abs(away) < reach
     x, y = away[close], profile[close]
-    sides = [y[x < -0.5 * reach].mean(), y[x > 0.5 * reach].mean()]
-    scale = max(*sides, 1e-30)
+    sides = [y[side] for side in (x < -0.5 * reach, x > 0.5 * reach)]
+    if min(map(len, sides)) == 0:  # lines lie so near to each other that nothing is between
+        return 0.0
+    levels = [max(float(side.mean()), 0.0) for side in sides]
+    scale = max(*levels, 1e-30)
 
     def miss(p):
         middle, half, blur, left, right = p
@@ -532,7 +615,7 @@ def _line(along: np.ndarray, profile: np.ndarray, start: float, reach: float) ->
 
     found = least_squares(
         miss,
-        [0.0, 0.25 * reach, 0.25 * reach, sides[0] / scale, sides[1] / scale],
+        [0.0, 0.25 * reach, 0.25 * reach, levels[0] / scale, levels[1] / scale],
         bounds=([-reach / 2, 0, 0.02 * reach, 0, 0], [reach / 2, reach, reach, 3, 3]),
         x_scale=[reach, reach, reach, 1, 1],
     )
@@ -572,7 +655,7 @@ def _lit_cells(image: np.ndarray, model: GridModel) -> np.ndarray:
     inside = ((near >= 0) & (near <= frame)).all(axis=(-1, 2, 3))
     near = np.clip(near, 0, frame)
     light = image[near[..., 0], near[..., 1]].mean(axis=(2, 3))
-    return cells[inside & (light > 0.3 * np.median(light[inside]))]
+    return cells[inside & (light > 0.3 * _typical(light[inside]))]
 
 
 def _whole(position: np.ndarray, shape: tuple[int, ...], margin: float) -> np.ndarray:

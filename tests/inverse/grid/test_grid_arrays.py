@@ -147,3 +147,59 @@ def test_the_rendering_itself():
         np.testing.assert_allclose(
             [(part * y).sum() / part.sum(), (part * x).sum() / part.sum()], centre, atol=0.02
         )
+
+
+def cells(layout, degrees, gap, pitch=23.3, count=(14, 16), fine=4):
+    """(image, centres): superpixels of square parts that are alike, with dark lines, `gap` of the
+    pitch, between these and between superpixels; in a frame that is a little larger.
+    """
+    turn = np.deg2rad(degrees)
+    vectors = pitch * np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+    count, shape = np.array(count), np.array(count) * 24 + 24
+    places = (np.indices(shape * fine) + 0.5) / fine - 0.5
+    middle = (shape - 1) / 2 + (0.3, -0.2)
+    at = np.einsum("ars,ab->brs", places - middle[:, None, None], np.linalg.inv(vectors))
+    at += count[:, None, None] / 2
+    lit = ((at > 0) & (at < count[:, None, None])).all(axis=0)
+    for axis, parts in enumerate(layout):
+        lit &= np.abs(at[axis] * parts % 1 - 0.5) < 0.5 - gap * parts / 2
+    light = lit.reshape(shape[0], fine, shape[1], fine).mean(axis=(1, 3))
+    image = np.random.default_rng(5).poisson(3000 * light + 15).astype(float)
+    index = np.stack(np.meshgrid(*(np.arange(n) + 0.5 for n in count), indexing="ij"), axis=-1)
+    return image, middle + (index - count / 2) @ vectors
+
+
+@pytest.mark.parametrize("layout", [(1, 2), (2, 2), (2, 3)])
+@pytest.mark.parametrize("degrees", [0.0, -2.3])
+def test_superpixels_whose_parts_look_alike_are_found_by_the_pitch_that_is_known(layout, degrees):
+    """Filters that pass as much of white light each: what repeats is a part, and dark lines are
+    the same between parts and between superpixels. The pitch is known to 4 %.
+    """
+    image, centres = cells(layout, degrees, 0.08)
+    known = {"parts": True, "count": centres.shape[:2], "pitch": 1.04 * 23.3}
+    found = find_grid(image, "mono", 15.0, "square", **known)
+    assert found.centres.shape == centres.shape and found.valid.all()
+    assert np.abs(found.centres - centres).max() < 0.05
+
+
+@pytest.mark.parametrize("gap, degrees, around", [(0.04, 2.3, 0), (0.08, 12, 300), (0.04, 0, 300)])
+def test_thin_lines_are_seen_in_an_array_that_is_smaller_than_its_sensor(gap, degrees, around):
+    image, centres = cells((1, 1), degrees, gap)
+    dark = np.random.default_rng(6).poisson(15.0, np.array(image.shape) + 2 * around)
+    dark[around : around + image.shape[0], around : around + image.shape[1]] = image
+    found = find_grid(dark.astype(float), "mono", 15.0, "square")
+    assert found.centres.shape == centres.shape and found.valid.all()
+    assert np.abs(found.centres - centres - around).max() < 0.05
+
+
+@pytest.mark.parametrize("pitch", [6.0, 37.3])
+def test_dark_surroundings_hold_no_lenslets(pitch):
+    array = next(a for a in arrays() if a.pitch == pitch)
+    image, truth = render(array)
+    around = 300
+    dark = np.random.default_rng(7).normal(400, 60, np.array(image.shape) + 2 * around)
+    dark[around : around + image.shape[0], around : around + image.shape[1]] = image
+    found = find_grid(dark, "mono", 400.0)
+    away = cKDTree(truth + around).query(found.centres[found.valid])[0]
+    assert away.max() < 0.1 * pitch
+    assert whole(truth, array).sum() <= found.valid.sum() <= len(truth)

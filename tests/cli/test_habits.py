@@ -154,7 +154,7 @@ def test_progress_with_the_time_that_is_left_on_a_terminal_only_and_never_in_col
     assert "points:" not in piped.stderr and "\r" not in piped.stderr
 
 
-@pytest.mark.parametrize("workers", ["1", "2"])
+@pytest.mark.parametrize("workers", [pytest.param("1", marks=pytest.mark.slow), "2"])
 def test_quiet_reaches_the_workers(folder, workers):
     """With --overlap 3 and a matrix without neighbours every capture has something to say."""
     out = folder / f"quiet{workers}.h5"

@@ -35,9 +35,11 @@ def campaign(request):
 
 
 @pytest.fixture(scope="session")
-def runner():
-    """A Runner for all tests of this process."""
-    with Runner() as made:
+def runner(campaign):
+    """A Runner for all tests of this process. In a campaign every command imports what draws by
+    itself, and faults reach that, too.
+    """
+    with Runner(campaign(("matplotlib.figure", "matplotlib.backends.backend_agg"), ())) as made:
         yield made
 
 

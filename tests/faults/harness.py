@@ -37,10 +37,11 @@ class Outcome:
 class Runner:
     """`run` a command line; use as a context manager."""
 
-    def __init__(self):
+    def __init__(self, modules=()):
+        """modules: imported once, not by each command that needs them."""
         environment = os.environ | {"PYTHONPATH": str(SERVER.parents[2])}
         self._server = subprocess.Popen(
-            [sys.executable, str(SERVER)],
+            [sys.executable, str(SERVER), *modules],
             env=environment,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,

@@ -1,6 +1,7 @@
 """Reads one JSON request a line, runs `plenocli` in a forked child, answers with one JSON line.
 
-See harness.py.
+See harness.py. Modules that the command line names are imported before, once; what is not named, a
+command that needs it imports by itself.
 
 A fault is {"call": name of a function of os, "nth": which call fails first, "error": errno name,
 "False" for what it returns or "KILL", "lasting": whether all later calls fail too, "of": another
@@ -30,7 +31,7 @@ WRITERS = ("write", "pwrite", "writev", "pwritev")
 def main():
     """Serve until stdin ends."""
     os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
-    _import_everything()
+    _import_everything(sys.argv[1:])
     channel = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
     for line in sys.stdin:
@@ -38,8 +39,11 @@ def main():
         channel.flush()
 
 
-def _import_everything():
+def _import_everything(names):
     import plenocli
+
+    for name in names:
+        importlib.import_module(name)
 
     for module in pkgutil.walk_packages(plenocli.__path__, "plenocli."):
         if not module.name.endswith("__main__"):
@@ -151,7 +155,8 @@ def _arm(fault, fired):
         return None
     number = getattr(errno, fault.get("error", "ENOSPC"), None)
     if fault["call"] == "without":
-        return sys.modules.update({fault["module"]: None})
+        within = [m for m in sys.modules if m.startswith(fault["module"] + ".")]
+        return sys.modules.update(dict.fromkeys([fault["module"], *within]))
     if fault["call"] == "bytes":
         return _arm_bytes(fault["nth"], number, fired)
     if fault["call"] == "filesize":

@@ -128,7 +128,18 @@ def test_energy_is_sound_or_the_camera_is_refused(runner, tmp_path, campaign, co
     )
 
 
-@pytest.mark.parametrize("method", ["block-mean", "tikhonov", "tsvd", "nnls", "lmmse", "auto"])
+@pytest.mark.parametrize(
+    "method",
+    [
+        "block-mean",
+        # linear, as LMMSE is
+        pytest.param("tikhonov", marks=pytest.mark.slow),
+        pytest.param("tsvd", marks=pytest.mark.slow),
+        "nnls",
+        "lmmse",
+        "auto",
+    ],
+)
 def test_captures_of_nothing_of_one_value_and_of_saturation_give_numbers(
     runner, stages, tmp_path, count, method
 ):

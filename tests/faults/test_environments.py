@@ -43,15 +43,15 @@ def shell(command, cwd, **environment):
 @pytest.mark.parametrize(
     "redirected, codes",
     [
-        (">&-", (0,)),
-        ("2>&-", (0,)),
+        pytest.param(">&-", (0,), marks=pytest.mark.slow),
+        pytest.param("2>&-", (0,), marks=pytest.mark.slow),
         (">&- 2>&-", (0,)),
         ("| true", (0,)),
         ("2> /dev/full", (0,)),
         ("> /dev/full", (4,)),
-        ("> /dev/full 2> /dev/full", (4,)),
+        pytest.param("> /dev/full 2> /dev/full", (4,), marks=pytest.mark.slow),
         ("1< /dev/null", (4,)),
-        ("< /dev/null", (0,)),
+        pytest.param("< /dev/null", (0,), marks=pytest.mark.slow),
         ("<&-", (0,)),
     ],
 )
@@ -207,7 +207,12 @@ def test_a_damaged_cache_of_compiled_functions_is_made_anew(compiled, tmp_path, 
 
 @pytest.mark.parametrize(
     "environment",
-    [{"LANG": "C", "LC_ALL": "C"}, {"TMPDIR": "/nowhere"}, {"HOME": "/nowhere"}, {"HOME": None}],
+    [
+        {"LANG": "C", "LC_ALL": "C"},
+        {"TMPDIR": "/nowhere"},
+        pytest.param({"HOME": "/nowhere"}, marks=pytest.mark.slow),
+        {"HOME": None},
+    ],
     ids=str,
 )
 def test_poor_environments(folder, environment):

@@ -49,8 +49,22 @@ SEVERAL = {
 }
 
 
-@pytest.mark.parametrize("command", SEVERAL.values(), ids=SEVERAL)
-@pytest.mark.parametrize("call", ["write", "pwrite", "fsync", "replace"])
+@pytest.mark.parametrize(
+    "call, command",
+    [
+        pytest.param(
+            call,
+            command,
+            id=f"{call}-{name}",
+            # the slowest, which go the way of the others; score calls no pwrite
+            marks=pytest.mark.slow
+            if call in ("pwrite", "fsync") and name in ("score", "sweep")
+            else (),
+        )
+        for call in ("write", "pwrite", "fsync", "replace")
+        for name, command in SEVERAL.items()
+    ],
+)
 def test_of_a_failure_all_results_stay_as_they_were(runner, folder, campaign, command, call):
     """Old files before, or none: every place where a call may fail, until none is left to fail;
     by default a few of them, in turn.

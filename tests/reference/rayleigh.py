@@ -193,12 +193,14 @@ def column_energies(
     pixel_nodes=6,
     f2=None,
     spheres=False,
+    field=None,
 ):
     """Energy in each pixel (of `rows`, default all) of a superpixel at `centre` (m, on the sensor)
     from each of the `image_points`: (points, rows, columns).
 
     lenslets: list of (row, column) whose fields add;
-    density scales the nodes of pupil and lenslet.
+    density scales the nodes of pupil and lenslet;
+    field: of the main lens, as main_lens_field makes it; by default a sum over directions.
     """
     k, z = 2 * np.pi / wavelength, camera.sensor.distance
     array, sensor = camera.lenslet_array, camera.sensor
@@ -213,9 +215,10 @@ def column_energies(
     if rows is not None:
         chosen = (np.asarray(rows)[:, None] * pixel_nodes + np.arange(pixel_nodes)).ravel()
         v, wv = v[chosen], wv[chosen]
-    directions = pupil_directions(
-        camera, density, wavelength, 1.5 * (1 + max(abs(n) for pair in lenslets for n in pair))
-    )
+    if field is None:
+        directions = pupil_directions(
+            camera, density, wavelength, 1.5 * (1 + max(abs(n) for pair in lenslets for n in pair))
+        )
     total = np.zeros((len(image_points), len(v), len(u)), complex)
     for row, column in lenslets:
         cy, cx = row * array.pitch, column * array.pitch
@@ -237,6 +240,8 @@ def column_energies(
                 field_of_spheres(camera, wavelength, point, y + cy, x + cx)
                 for point in image_points
             ]
+        elif field is not None:
+            fields = [field(point, y + cy, x + cx) for point in image_points]
         else:
             fields = [
                 field_on_array(camera, wavelength, point, y + cy, x + cx, directions)

@@ -342,6 +342,7 @@ def test_superpixels_beside_the_own_one():
             tuple(pitch * n for n in place),
             pixel_nodes=9,
             rows=rows,
+            field=main_lens_field(camera, 3 * camera.lenslet_array.pitch),
         )
         for place in [(-1, 1), (-1, 0), (0, 0)]
     }

@@ -1,5 +1,7 @@
 """The system matrix against brute-force Fresnel quadrature, for each feature of a camera."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 
@@ -19,7 +21,14 @@ def image_point(camera, index):
     )
 
 
-def compare(camera, index, *, ring=0, accuracy=1e-6, lenslets=None, **oracle):
+@cache
+def known(changes):
+    """The oracle's column of the first point of a small camera, once for all accuracies."""
+    camera = small_camera(**dict(changes))
+    return pixel_energies(camera, WAVELENGTH, image_point(camera, 0), ISOLATED, (0, 0))
+
+
+def compare(camera, index, *, ring=0, accuracy=1e-6, lenslets=None, truth=None, **oracle):
     """Relative L2 error of one column of A for the object's own superpixel."""
     builder = pif_builder(
         camera,
@@ -30,14 +39,15 @@ def compare(camera, index, *, ring=0, accuracy=1e-6, lenslets=None, **oracle):
         dtype=np.float64,
     )
     column = builder.columns([index])[0, :, 0].reshape(camera.sensor.pixels_per_lenslet)
-    truth = pixel_energies(
-        camera,
-        WAVELENGTH,
-        image_point(camera, index),
-        lenslets or (NEIGHBOURS if ring else ISOLATED),
-        (0, 0),
-        **oracle,
-    )
+    if truth is None:
+        truth = pixel_energies(
+            camera,
+            WAVELENGTH,
+            image_point(camera, index),
+            lenslets or (NEIGHBOURS if ring else ISOLATED),
+            (0, 0),
+            **oracle,
+        )
     return np.linalg.norm(column - truth) / np.linalg.norm(truth)
 
 
@@ -214,4 +224,5 @@ def test_neighbouring_superpixels_out_of_focus_with_all_lenslets_of_the_window()
     "change", [{}, {"lenslet_array__aperture_shape": "circle"}, {"object__distance": 0.52}], ids=str
 )
 def test_accuracy_is_kept(accuracy, change):
-    assert compare(small_camera(**change), 0, accuracy=accuracy) < accuracy
+    truth = known(tuple(change.items()))
+    assert compare(small_camera(**change), 0, accuracy=accuracy, truth=truth) < accuracy

@@ -244,7 +244,9 @@ def test_a_look_that_leaves_pixels_out_explains_no_more(bench):
     assert not some.explains_more_than(every)
 
 
-@pytest.mark.parametrize("shift", [(0.4, -0.25), (0.5, -0.25)])
+@pytest.mark.parametrize(
+    "shift", [pytest.param((0.4, -0.25), marks=pytest.mark.slow), (0.5, -0.25)]
+)
 def test_parts_of_a_pixel_cost_little(bench, solve, checkerboard, shift):
     """Light of the neighbours' own superpixels enters through the rim."""
     camera, _, _, shoot = bench

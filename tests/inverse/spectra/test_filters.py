@@ -3,6 +3,7 @@ mean of reflectance over what each filter passes.
 """
 
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -34,6 +35,7 @@ def reflectance(wavelengths):
     return 0.1 + 0.8 * np.where(np.arange(6)[:, None] % 2, steps, 1 - steps)
 
 
+@cache
 def seen(fwhm, blocking=1e-3):
     """(camera, calibration in narrow bands, superpixels of the objects) of four filters."""
     camera = pc.read_camera(SAMPLES / "seed_spectral.toml")

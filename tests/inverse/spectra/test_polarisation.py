@@ -100,15 +100,23 @@ def calibration(camera, shoot):
     ).calibration
 
 
+@pytest.fixture(scope="module")
+def solver(camera, calibration):
+    return Demultiplexer(calibration, camera=camera, ratio=True)
+
+
+@pytest.fixture(scope="module")
+def white(solver, shoot):
+    return solver.estimate(shoot(Uniform(REFERENCE_REFLECTANCE), seed=3), "white", "pinv")
+
+
 def board(seed):
     """A degree of polarisation for every lenslet, (row, column, 1)."""
     return np.random.default_rng(seed).uniform(-0.9, 0.9, (*COUNT, 1))
 
 
 @pytest.mark.parametrize("method", ["auto", "pinv"])
-def test_every_lenslets_polarisation_is_found(camera, calibration, shoot, method):
-    solver = Demultiplexer(calibration, camera=camera, ratio=True)
-    white = solver.estimate(shoot(Uniform(REFERENCE_REFLECTANCE), seed=3), "white", "pinv")
+def test_every_lenslets_polarisation_is_found(camera, solver, white, shoot, method):
     degree = board(4)
     found = solver.estimate(shoot(Polarised(Grey(), degree, "fit"), seed=5), "shot", method)
     found = stokes(found.relative_to(white, REFERENCE_REFLECTANCE))
@@ -123,9 +131,7 @@ def test_every_lenslets_polarisation_is_found(camera, calibration, shoot, method
         assert 0.4 < np.sqrt((z**2).mean()) < 2
 
 
-def test_light_without_polarisation_has_none(camera, calibration, shoot):
-    solver = Demultiplexer(calibration, camera=camera, ratio=True)
-    white = solver.estimate(shoot(Uniform(REFERENCE_REFLECTANCE), seed=3), "white", "pinv")
+def test_light_without_polarisation_has_none(solver, white, shoot):
     found = solver.estimate(shoot(Grey(), seed=6), "shot", "pinv").relative_to(
         white, REFERENCE_REFLECTANCE
     )

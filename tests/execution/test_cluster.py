@@ -159,6 +159,7 @@ def test_a_cluster_gives_the_same_bytes_and_loses_nothing_with_a_worker(cluster,
             and (not kept.exists() or kept.read_bytes().count(b'"status"') < 2)
         ):
             time.sleep(0.01)
+        assert child.poll() is None, "the points were over before anyone could be killed"
         os.killpg(first.pid, signal.SIGKILL)
         first.wait()
         assert child.wait(timeout=300) == 0, (tmp_path / "log").read_text()

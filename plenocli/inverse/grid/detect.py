@@ -52,6 +52,8 @@ ALIKE = 0.7
 """Of the chosen lines' depth, from which on others might as well be the superpixels' borders."""
 FRAME_TOLERANCE = 0.4
 """px by which a cell's edge may seem to lie outside the frame: sensors end where the array does."""
+AROUND = 2
+"""Sites beyond those that were measured which may be of the array, too."""
 FEWEST = 100
 """Lenslets from which on a scene can be told from what repeats in it."""
 LIGHT = 0.6
@@ -131,7 +133,7 @@ def find_grid(
     if structured and kind == "square":
         moved = _to_dark_borders(image, model, index[inside], pitch, near=near, count=count)
         position = position + moved.at(index) - model.at(index)
-        model, lit = moved, _lit_cells(image, moved)
+        model, lit = moved, _lit_cells(image, moved, index[inside])
     miss = np.where(inside, np.hypot(*(position - model.at(index)).T), np.nan)
     if near is not None:
         _check_near(model, near, pitch)
@@ -509,13 +511,12 @@ def _to_dark_borders(
     for down, depth_down in lines[0]:
         for right, depth_right in lines[1]:
             moved = replace(model, shift=model.shift - np.array([down, right]))
-            cells = _cells(moved, image.shape)
-            whole = _whole(moved.at(cells), image.shape, 0.5 * pitch)
+            whole = _whole(moved.at(_block(index)), image.shape, 0.5 * pitch)
             hint = 0.0
             if near is not None:
                 hint = -float(np.hypot(*(moved.at(np.rint(_index_at(moved, near))) - near)))
             elif count is not None:
-                lit = _lit_cells(image, moved)
+                lit = _lit_cells(image, moved, index)
                 shape = np.ptp(lit, axis=0) + 1 if len(lit) else (0, 0)
                 hint = -float(np.abs(np.subtract(shape, count)).sum())
             found.append(((hint, int(whole.sum())), depth_down + depth_right, moved))
@@ -634,21 +635,21 @@ def _index_at(model: GridModel, position: Sequence[float] | np.ndarray) -> np.nd
     return site
 
 
-def _cells(model: GridModel, shape: tuple[int, ...]) -> np.ndarray:
-    """Indices (M, N, 2) of a block of sites that covers the frame."""
-    corners = np.array([_index_at(model, c) for c in [(0, 0), (0, shape[1]), (shape[0], 0), shape]])
-    low, high = (
-        np.floor(corners.min(axis=0)).astype(int) - 1,
-        np.ceil(corners.max(axis=0)).astype(int) + 1,
-    )
+def _block(index: np.ndarray) -> np.ndarray:
+    """Indices (M, N, 2) of a block of sites around `index` (N, 2) and AROUND more: further out no
+    map is to be trusted.
+    """
+    low, high = index.min(axis=0) - AROUND, index.max(axis=0) + AROUND
     return np.stack(
         np.meshgrid(*(np.arange(a, b + 1) for a, b in zip(low, high)), indexing="ij"), axis=-1
     )
 
 
-def _lit_cells(image: np.ndarray, model: GridModel) -> np.ndarray:
-    """Indices (N, 2) of the sites whose cell holds at least 0.3 of the typical light."""
-    cells = _cells(model, image.shape)
+def _lit_cells(image: np.ndarray, model: GridModel, index: np.ndarray) -> np.ndarray:
+    """Indices (N, 2) of the sites in the `_block` of `index` whose cell holds at least 0.3 of the
+    typical light.
+    """
+    cells = _block(index)
     inner = np.stack(np.meshgrid(*[np.linspace(-0.4, 0.4, 9)] * 2, indexing="ij"), axis=-1)
     near = np.rint(model.at(cells[:, :, None, None] + inner)).astype(int)
     frame = np.array(image.shape) - 1

@@ -23,6 +23,8 @@ BLOCKS = 5
 """Blocks a side of the array, of which the map must foretell each from the others where
 neighbouring places err alike.
 """
+FEW = 8
+"""Sites of little weight from which on they are asked whether a map goes astray there."""
 ENOUGH = 2000
 """Sites for the first, rough part of a fit."""
 
@@ -131,10 +133,26 @@ def choose_model(
         1 if weight is None else np.asarray(weight) ** 2
     )
     error = {kind: _left_out(model, index, position, common) for kind, model in fitted.items()}
+    wild = set() if weight is None else _wild(fitted, index, position, np.asarray(weight))
+    error = {kind: miss for kind, miss in error.items() if kind not in wild}
     margin = 1 + max(MARGIN, 2 / np.sqrt(2 * count))
     best = min(error.values())
-    kind = next(kind for kind in allowed if error[kind] <= margin * best + 1e-9)
+    kind = next(kind for kind in error if error[kind] <= margin * best + 1e-9)
     return fitted[kind], error
+
+
+def _wild(
+    fitted: dict[str, GridModel], index: np.ndarray, position: np.ndarray, weight: np.ndarray
+) -> set[str]:
+    """Kinds of maps that go astray on the border of a small array, where sites have little weight:
+    those of few lenslets follow what pixels do to edges.
+    """
+    border = weight < weight.max()
+    if border.sum() < FEW:
+        return set()
+    index, position = index[border], position[border]
+    miss = {k: float(np.quantile(_miss(m, index, position), 0.65)) for k, m in fitted.items()}
+    return {kind for kind, far in miss.items() if far > 1.5 * min(miss.values()) + 0.01}
 
 
 def choose_by_blocks(

@@ -7,11 +7,16 @@ picture and whose second points right; a site (m, n) lies at origin + m * basis[
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
 SMALLEST_PITCH, LARGEST_PITCH = 4.5, 330.0
+AS_WELL, WELL = 0.93, 0.8
+"""Of the correlation at a lattice's points, from which on points half way are points of it, and
+where that makes a hexagonal one of a rectangular one.
+"""
 SQUARE_STEPS = np.array([(1, 0), (-1, 0), (0, 1), (0, -1)])
 HEXAGONAL_STEPS = np.array([(1, 0), (-1, 0), (0, 1), (0, -1), (1, -1), (-1, 1)])
 
@@ -107,7 +112,7 @@ def find_basis(image: np.ndarray) -> Periodicity:
     if not len(rest) or np.hypot(*rest[0]) > 2.1 * np.hypot(*first):
         return Periodicity(reason="it repeats in one direction only")
     basis = _refine_basis(smooth, centre, reduced(np.array([first, rest[0]], float)))
-    basis = reduced(basis)
+    basis = _with_halves(smooth, centre, reduced(basis), max(SMALLEST_PITCH, 1.2 * ring))
     half = np.rint(centre + 0.5 * np.array([basis[0], basis[1], basis[0] + basis[1]])).astype(int)
     return Periodicity(basis, float(smooth[tuple(half.T)].max()) / strength, strength)
 
@@ -306,6 +311,34 @@ def _refine_basis(value: np.ndarray, centre: np.ndarray, basis: np.ndarray) -> n
                 used.append(step)
         if len(used) >= 3:
             basis = np.linalg.lstsq(np.array(used, float), np.array(peaks), rcond=None)[0]
+    return basis
+
+
+def _with_halves(
+    value: np.ndarray, centre: np.ndarray, basis: np.ndarray, least: float
+) -> np.ndarray:
+    """The basis with the points half way between those of its lattice that correlate as well:
+    narrow peaks, of thin lines, may be missed where they fall between samples. No vector is
+    shorter than `least`, px.
+    """
+    steps = np.array(list(np.ndindex(5, 5))) - 2
+
+    def height(offset: tuple[float, float]) -> float:
+        """Mean height of the peaks near the lattice's points, so far aside."""
+        at = (steps + offset) @ basis
+        at = np.rint(at[(np.hypot(*at.T) > 1) & (np.abs(at) < centre - 2).all(axis=1)] + centre)
+        near = at.astype(int)[:, None] + np.array(list(np.ndindex(3, 3))) - 1
+        return float(value[near[..., 0], near[..., 1]].mean()) if len(at) else -1.0
+
+    short, long = sorted(np.hypot(*basis.T))
+    hexagonal = abs(long / short / math.sqrt(3) - 1) < 0.03  # with its middle, as no square is
+    for offset in ((0.5, 0.5), (0.5, 0.0), (0.0, 0.5)):
+        enough = WELL if hexagonal and min(offset) else AS_WELL
+        if height(offset) > enough * height((0.0, 0.0)):
+            halved = [(0.5, 0.5), (0.5, -0.5)] if min(offset) else np.eye(2) - np.diag(offset)
+            finer = reduced(np.array(halved) @ basis)
+            if np.hypot(*finer[0]) > least:
+                return _with_halves(value, centre, finer, least)
     return basis
 
 

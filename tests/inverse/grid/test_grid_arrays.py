@@ -182,9 +182,14 @@ def test_superpixels_whose_parts_look_alike_are_found_by_the_pitch_that_is_known
     assert np.abs(found.centres - centres).max() < 0.05
 
 
-@pytest.mark.parametrize("gap, degrees, around", [(0.04, 2.3, 0), (0.08, 12, 300), (0.04, 0, 300)])
-def test_thin_lines_are_seen_in_an_array_that_is_smaller_than_its_sensor(gap, degrees, around):
-    image, centres = cells((1, 1), degrees, gap)
+@pytest.mark.parametrize(
+    "gap, degrees, around, count",
+    [(0.04, 2.3, 0, (14, 16)), (0.08, 12, 300, (14, 16)), (0.15, 0, 200, (11, 11))],
+)
+def test_thin_lines_are_seen_in_an_array_that_is_smaller_than_its_sensor(
+    gap, degrees, around, count
+):
+    image, centres = cells((1, 1), degrees, gap, count=count)
     dark = np.random.default_rng(6).poisson(15.0, np.array(image.shape) + 2 * around)
     dark[around : around + image.shape[0], around : around + image.shape[1]] = image
     found = find_grid(dark.astype(float), "mono", 15.0, "square")
@@ -203,3 +208,27 @@ def test_dark_surroundings_hold_no_lenslets(pitch):
     away = cKDTree(truth + around).query(found.centres[found.valid])[0]
     assert away.max() < 0.1 * pitch
     assert whole(truth, array).sum() <= found.valid.sum() <= len(truth)
+
+
+@pytest.mark.parametrize("kind", ["square", "hexagonal"])
+@pytest.mark.parametrize("degrees", [0, 30, 44])
+def test_thin_lines_of_small_lenslets_are_no_coarser_lattice(kind, degrees):
+    """Half a pixel of darkness between cells of nine: every other lattice point alone was seen to
+    repeat where these fall on the raster alike.
+    """
+    turn, pitch, size, fine = np.deg2rad(degrees), 9.0, 270, 3
+    straight = np.eye(2) if kind == "square" else np.array([(np.sqrt(0.75), 0.5), (0, 1)])
+    vectors = pitch * straight @ [[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]]
+    index = np.stack(np.meshgrid(*[np.arange(-60, 61)] * 2, indexing="ij"), axis=-1).reshape(-1, 2)
+    centres = index @ vectors + size / 2
+    places = (np.indices((size * fine,) * 2).reshape(2, -1).T + 0.5) / fine - 0.5
+    away, near = cKDTree(centres).query(places, 2)
+    apart = np.hypot(*(centres[near[:, 0]] - centres[near[:, 1]]).T)
+    lit = (away[:, 1] ** 2 - away[:, 0] ** 2) / (2 * apart) > 0.03 * pitch
+    light = lit.reshape(size, fine, size, fine).mean(axis=(1, 3))
+    found = find_grid(
+        np.random.default_rng(1).poisson(3000 * light + 15).astype(float), "mono", 15.0
+    )
+    assert found.lattice == kind
+    assert cKDTree(centres).query(found.centres[found.valid])[0].max() < 0.1
+    assert found.valid.sum() > 0.85 * (size / pitch) ** 2

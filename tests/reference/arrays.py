@@ -8,6 +8,7 @@ how grids are found.
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 
 @dataclass(frozen=True)
@@ -152,3 +153,28 @@ def _add_spot(light, array, centre, level):
     light[low[0] : high[0], low[1] : high[1]] += level * np.einsum(
         "aibj,i,j->ab", cells, weights / 2, weights / 2
     )
+
+
+def filled(kind, pitch, degrees, gap, lenslets, around=0, falloff=0.0, seed=0):
+    """(white, centres): lenslets without borders of their own, whose light fills their cells but
+    for dark lines, in a square frame; black level 15, white 3015.
+
+    gap: of the lines, in pitches.
+    lenslets: on a side, about.
+    around: px of dark sensor on all sides.
+    falloff: of the light in the corners.
+    """
+    turn, size, fine = np.deg2rad(degrees), int(lenslets * pitch), 3
+    straight = np.eye(2) if kind == "square" else np.array([(np.sqrt(0.75), 0.5), (0, 1)])
+    vectors = pitch * straight @ [[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]]
+    index = np.stack(np.meshgrid(*[np.arange(-2 * lenslets, 2 * lenslets + 1)] * 2), axis=-1)
+    sites = index.reshape(-1, 2) @ vectors + size / 2 + (0.3, -0.2)
+    there = (np.abs(sites - size / 2) < size / 2 - pitch / 2).all(axis=1)
+    places = (np.indices((size * fine,) * 2).reshape(2, -1).T + 0.5) / fine - 0.5
+    away, near = cKDTree(sites).query(places, 2)
+    apart = np.hypot(*(sites[near[:, 0]] - sites[near[:, 1]]).T)
+    lit = (away[:, 1] ** 2 - away[:, 0] ** 2) / apart > gap * pitch
+    light = (lit & there[near[:, 0]]).reshape(size, fine, size, fine).mean(axis=(1, 3))
+    light *= 1 - falloff * np.clip(((np.indices(light.shape) * 2 / size - 1) ** 2).sum(0) / 2, 0, 1)
+    image = np.random.default_rng(seed).poisson(3000 * np.pad(light, around) + 15).astype(float)
+    return image, sites[there] + around

@@ -36,7 +36,7 @@ STRONG = 0.6
 """
 FAINT = 0.04
 """Of the typical light of a lenslet, below which a spot is noise of dark surroundings."""
-SCATTER = 0.07
+SCATTER = 0.1
 """Of the pitch, by which spots may scatter (rms) about the best grid."""
 BORDER_WEIGHT = 0.1
 """Of a lenslet without whole neighbours on all sides: light that they lack, or a cut, moves it."""

@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from plenocli.inverse.grid.detect import find_grid
 from plenocli.inverse.grid.distortion import share_between
-from tests.reference.arrays import Array, render, true_centres, whole
+from tests.reference.arrays import Array, filled, render, true_centres, whole
 
 PITCHES = (6.0, 8.3, 11.7, 16.4, 24.0, 37.3, 61.9, 200.0)
 ANGLES = (0.0, 0.4, 3.7, 9.0, 14.0, 20.0, 25.5, 30.0)
@@ -216,19 +216,33 @@ def test_thin_lines_of_small_lenslets_are_no_coarser_lattice(kind, degrees):
     """Half a pixel of darkness between cells of nine: every other lattice point alone was seen to
     repeat where these fall on the raster alike.
     """
-    turn, pitch, size, fine = np.deg2rad(degrees), 9.0, 270, 3
-    straight = np.eye(2) if kind == "square" else np.array([(np.sqrt(0.75), 0.5), (0, 1)])
-    vectors = pitch * straight @ [[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]]
-    index = np.stack(np.meshgrid(*[np.arange(-60, 61)] * 2, indexing="ij"), axis=-1).reshape(-1, 2)
-    centres = index @ vectors + size / 2
-    places = (np.indices((size * fine,) * 2).reshape(2, -1).T + 0.5) / fine - 0.5
-    away, near = cKDTree(centres).query(places, 2)
-    apart = np.hypot(*(centres[near[:, 0]] - centres[near[:, 1]]).T)
-    lit = (away[:, 1] ** 2 - away[:, 0] ** 2) / (2 * apart) > 0.03 * pitch
-    light = lit.reshape(size, fine, size, fine).mean(axis=(1, 3))
-    found = find_grid(
-        np.random.default_rng(1).poisson(3000 * light + 15).astype(float), "mono", 15.0
-    )
+    pitch = 9.13 if degrees == 0 else 9.0  # of nine, no image tells where in a pixel lines lie
+    white, centres = filled(kind, pitch, degrees, 0.06, 30)
+    _all_are_found(find_grid(white, "mono", 15.0), kind, pitch, centres, len(white))
+
+
+def _all_are_found(found, kind, pitch, centres, size, around=0):
+    """Those that are not at the border, within 2 % of the pitch, or 0.15 px."""
     assert found.lattice == kind
-    assert cKDTree(centres).query(found.centres[found.valid])[0].max() < 0.1
-    assert found.valid.sum() > 0.85 * (size / pitch) ** 2
+    low, high = around + 1.2 * pitch, around + size - 1.2 * pitch
+    inner = centres[((centres > low) & (centres < high)).all(axis=1)]
+    away = cKDTree(found.centres[found.valid]).query(inner)[0]
+    assert np.quantile(away, 0.95) < max(0.15, 0.02 * pitch)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(60))
+def test_filled_arrays_of_any_kind_are_found(seed):
+    rng = np.random.default_rng(seed)
+    kind, pitch = ("square", "hexagonal")[rng.integers(2)], float(np.exp(rng.uniform(1.8, 4.1)))
+    degrees = float(rng.uniform(-45, 45) if rng.uniform() < 0.5 else rng.uniform(-3, 3))
+    gap, around = float(rng.uniform(0.04, 0.4)), int(rng.choice([0, 0, 60, 250]))
+    lenslets = int(rng.uniform(12, min(30, max(12.5, 420 / pitch))))
+    falloff = float(rng.uniform(0, 0.5))
+    white, centres = filled(kind, pitch, degrees, gap, lenslets, around, falloff, seed)
+    cfa = "RGGB" if rng.uniform() < 0.4 else "mono"
+    if cfa == "RGGB":
+        gains = np.tile(rng.uniform(0.3, 1, (2, 2)), np.array(white.shape) // 2 + 1)
+        white = rng.poisson(white * gains[: white.shape[0], : white.shape[1]]).astype(float)
+    size = white.shape[0] - 2 * around
+    _all_are_found(find_grid(white, cfa, 15.0), kind, pitch, centres, size, around)

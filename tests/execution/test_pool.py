@@ -111,6 +111,14 @@ def test_linear_algebra_has_one_thread_everywhere(tasks, monkeypatch):
     assert os.environ["OMP_NUM_THREADS"] == "2"
 
 
+def with_two_threads(code):
+    """A process that ran the code, whose linear algebra starts with two threads."""
+    threads = {"OMP_NUM_THREADS": "2", "OPENBLAS_NUM_THREADS": "2"}
+    return subprocess.run(
+        [sys.executable, "-c", code], env=os.environ | threads, capture_output=True, text=True
+    )
+
+
 def test_a_library_that_is_loaded_by_a_task_has_one_thread():
     code = (
         "import numpy\n"
@@ -122,10 +130,7 @@ def test_a_library_that_is_loaded_by_a_task_has_one_thread():
         "    found = [i['num_threads'] for i in threadpool_info() if i['user_api'] == 'blas']\n"
         "print(len(found) > 1, max(found))"
     )
-    threads = {"OMP_NUM_THREADS": "2", "OPENBLAS_NUM_THREADS": "2"}
-    done = subprocess.run(
-        [sys.executable, "-c", code], env=os.environ | threads, capture_output=True, text=True
-    )
+    done = with_two_threads(code)
     assert done.stdout.split() == ["True", "1"], done.stderr
 
 
@@ -141,10 +146,7 @@ def test_a_library_that_came_since_it_was_looked_for_has_one_thread():
         "with one_thread(): inside = blas()\n"
         "print(len(inside) > 1, max(inside), *set(blas()))"
     )
-    threads = {"OMP_NUM_THREADS": "2", "OPENBLAS_NUM_THREADS": "2"}
-    done = subprocess.run(
-        [sys.executable, "-c", code], env=os.environ | threads, capture_output=True, text=True
-    )
+    done = with_two_threads(code)
     assert done.stdout.split() == ["True", "1", "2"], done.stderr
 
 

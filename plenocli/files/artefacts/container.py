@@ -361,9 +361,7 @@ def _write_parts(file, schema, path, values):
 
     def put(block):
         before, row = divmod(at, rows)
-        corner = (
-            (*np.unravel_index(before, shape[:axis]), row // inner) if axis else (row // inner,)
-        )
+        corner = *np.unravel_index(before, shape[:axis]), row // inner
         block = block.reshape((1,) * axis + (-1,) + shape[axis + 1 :])
         write_chunks(made, corner + (0,) * (len(shape) - axis - 1), block)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -407,8 +407,9 @@ def _grid(
     try:
         if not isinstance(signal, np.ndarray):
             return find_scene_grid(signal, white.cfa, lattice, near, parts=parts, count=count)
-        known: Any = {"parts": parts, "count": count, "pitch": pitch}
-        return find_grid(_filled(signal), white.cfa, None, lattice, near, **known)
+        return find_grid(
+            _filled(signal), white.cfa, None, lattice, near, parts=parts, count=count, pitch=pitch
+        )
     except (NumericsError, InputError) as error:
         raise error.at(white.metadata.path) from None
 

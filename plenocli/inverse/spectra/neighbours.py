@@ -239,9 +239,8 @@ def _predicted(
         found = _by_part(builder.whole(), sampled)
         bands.append((found if modes is None else found @ modes.basis).astype(np.float32))
     shape = there(calibration.windows).shape
-    light = _further(np.stack(bands, axis=-1), offsets, whole, shape) * _colours(
-        camera, calibration
-    )[:, None].astype(np.float32)
+    light = _further(np.stack(bands, axis=-1), offsets, whole, shape)
+    light = light * _colours(camera, calibration)[:, None].astype(np.float32)
     even = np.ones(POINTS**2) if modes is None else modes.even
     known = np.einsum("opmk,m,pk->k", light, even, np.isfinite(measured))
     light *= np.nansum(measured, axis=0) / np.maximum(known, 1e-300)

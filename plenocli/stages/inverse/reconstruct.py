@@ -566,10 +566,10 @@ def _in_tiles(
     task = _TileTask(
         recipe=recipe, capture=capture, finer=finer, model_error=_off(limits), whole=whole
     )
-    others = tiles if method.weighs_all else spread_over(source.count, side_of(system))
     data, cause = replace(data, whole=whole), partial(likely_cause, estimators)
     sample, seen = estimate(estimators, method, data, model_error=_off(limits), explain=cause)
-    task = task.sharing(pool, others)
+    all_weigh = METHODS[sample.method].weighs_all  # of the one that auto took
+    task = task.sharing(pool, tiles if all_weigh else spread_over(source.count, side_of(system)))
     depends = replace(settings, workers=1), recipe.digests, file_digest(capture), tiles
     bench = Bench.beside(target, depends)
     clip = partial(np.maximum, 0) if settings.clip else np.asarray

@@ -8,13 +8,14 @@ the places support. See docs/model.md, "Spectral response: calibration and demul
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from plenocli.base.errors import InputError, NumericsError
-from plenocli.base.progress import note
+from plenocli.base.progress import collected_notes, note
 from plenocli.base.text import by
 from plenocli.forward.sensor.frames import dead_pixels, shifted_neighbours
 from plenocli.inverse.grid import distortion, lattice, spots, template
@@ -94,7 +95,8 @@ def find_grid(
         array do: one that is much brighter than the others passes for all of the superpixel.
     count: lenslets (rows, columns), where they are known: of several phases that of this count is
         taken.
-    pitch: px between superpixels, where it is known about: parts that look alike repeat oftener.
+    pitch: px between superpixels, where it is known about: parts that look alike repeat oftener,
+        and are put together unless `count` says that there are as many superpixels.
     scene: how the image repeats if it is no white one but captures of a scene, evened
         (plenocli.inverse.grid.scenes); then the error that is expected is found, too.
 
@@ -139,6 +141,12 @@ def find_grid(
         _check_near(model, near, pitch)
     found = _assemble(kind, model, index, miss, clean, image.shape, pitch, lit)
     found = replace(found, expected_error=error)
+    if alike and count is not None and found.valid.shape != tuple(count):
+        # a description of the wrong pitch groups whole superpixels
+        with contextlib.suppress(NumericsError), collected_notes():
+            plain = find_grid(white, cfa, dark, lattice_kind, near, crop, parts=parts, count=count)
+            if plain.valid.shape == tuple(count):
+                return plain
     if count is not None and found.valid.shape != tuple(count):
         note(
             f"warning: {by(found.valid.shape)} lenslets are found where {by(count)} are known: "

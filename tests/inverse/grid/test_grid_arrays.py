@@ -182,6 +182,15 @@ def test_superpixels_whose_parts_look_alike_are_found_by_the_pitch_that_is_known
     assert np.abs(found.centres - centres).max() < 0.05
 
 
+def test_a_pitch_that_is_twice_too_large_puts_no_superpixels_together():
+    """Where their number is known; without it the pitch is believed."""
+    image, centres = cells((1, 1), 0.7, 0.2)
+    known = {"parts": True, "count": centres.shape[:2], "pitch": 2 * 23.3}
+    found = find_grid(image, "mono", 15.0, "square", **known)
+    assert found.centres.shape == centres.shape and found.valid.all()
+    assert np.abs(found.centres - centres).max() < 0.05
+
+
 @pytest.mark.parametrize(
     "gap, degrees, around, count",
     [(0.04, 2.3, 0, (14, 16)), (0.08, 12, 300, (14, 16)), (0.15, 0, 200, (11, 11))],

@@ -37,14 +37,14 @@ from plenocli.forward.scene.scenes import Photograph, Scene
 from plenocli.forward.scene.tables import illuminant
 from plenocli.forward.scene.white_reference import REFERENCE_REFLECTANCE
 from plenocli.forward.sensor.capture import Capture
-from plenocli.forward.sensor.exposure import (
-    ExposureOptions,
+from plenocli.forward.sensor.exposure.matrices import StoredMatrix
+from plenocli.forward.sensor.exposure.options import ExposureOptions
+from plenocli.forward.sensor.exposure.simulate import (
     SimulatedCapture,
-    StoredMatrix,
     require_memory_for,
     require_tiling,
 )
-from plenocli.forward.sensor.exposure import simulate_capture as expose
+from plenocli.forward.sensor.exposure.simulate import simulate_capture as expose
 from plenocli.forward.sensor.noise import Noise
 from plenocli.inverse.calibration import measure
 from plenocli.inverse.calibration.calibration import Calibration

@@ -166,7 +166,7 @@ def superpixel(camera, target):
     from scipy.ndimage import shift
 
     from plenocli.forward.sensor.cfa import cfa_map
-    from plenocli.forward.sensor.exposure import carry_light
+    from plenocli.forward.sensor.exposure.carried_light import carry_light
     from plenocli.stages.forward.capture_sim import Settings, _source
 
     settings = Settings(target=target, superpixels=(3, 3), model="fresnel", accuracy=1e-3)

@@ -160,7 +160,7 @@ class Bench:
 
     def _seen_by(self, camera):
         from plenocli.forward.accuracy.dial import pif_builder
-        from plenocli.forward.sensor.exposure import StoredMatrix
+        from plenocli.forward.sensor.exposure.matrices import StoredMatrix
 
         found, sides = {}, (self.superpixels, self.superpixels)
         for w in {*map(float, self.light.wavelengths), *camera.light.wavelengths}:
@@ -174,7 +174,8 @@ class Bench:
 
     def shoot(self, scene, seed, exposure=1.0, light=None):
         """One capture."""
-        from plenocli.forward.sensor.exposure import ExposureOptions, simulate_capture
+        from plenocli.forward.sensor.exposure.options import ExposureOptions
+        from plenocli.forward.sensor.exposure.simulate import simulate_capture
 
         options = ExposureOptions(seed=seed, exposure=exposure * self.camera.light.white_exposure)
         return simulate_capture(
@@ -297,7 +298,8 @@ def joint(name, seeds):
     demux, one factor a band left free: one matrix of 12 points a side, 45 dB.
     """
     import plenocli.api as pc
-    from plenocli.forward.sensor.exposure import ExposureOptions, simulate_capture
+    from plenocli.forward.sensor.exposure.options import ExposureOptions
+    from plenocli.forward.sensor.exposure.simulate import simulate_capture
     from plenocli.inverse.spectra.demultiplexer import Demultiplexer
 
     camera = camera_of(name).replace(**{"object.samples_per_lenslet": (12, 12)})

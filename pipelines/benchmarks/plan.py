@@ -36,7 +36,8 @@ from plenocli.forward.accuracy.limiting_error import what_limits
 from plenocli.forward.propagation.diagnosis import describe
 from plenocli.forward.propagation.system_matrix import build_pif
 from plenocli.forward.scene.light import Quadrature
-from plenocli.forward.sensor.exposure import ExposureOptions, simulate_capture
+from plenocli.forward.sensor.exposure.options import ExposureOptions
+from plenocli.forward.sensor.exposure.simulate import simulate_capture
 from plenocli.inverse.chain import costs
 from plenocli.inverse.chain.chains import INVERSIONS, chains_of, matrix_options
 from plenocli.inverse.chain.choose import PROBE, choose

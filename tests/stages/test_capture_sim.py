@@ -13,7 +13,7 @@ from plenocli.files.artefacts.provenance import Provenance
 from plenocli.files.config.camera_file import load_camera, parse_camera
 from plenocli.files.images.mosaic import read_capture
 from plenocli.forward.accuracy.dial import system_matrix
-from plenocli.forward.sensor import exposure
+from plenocli.forward.sensor.exposure import simulate
 from plenocli.stages.forward import capture_sim
 
 TINY = Path(__file__).resolve().parents[2] / "sample_configs" / "tiny.toml"
@@ -581,7 +581,7 @@ def test_more_memory_than_granted_is_refused_before_it_is_taken(camera, tmp_path
 
 def in_bands(monkeypatch, rows, columns=4, pixels=81):
     """From now on sensors are exposed in bands of so many rows of lenslets."""
-    monkeypatch.setattr(exposure, "BAND", rows * columns * pixels)
+    monkeypatch.setattr(simulate, "BAND", rows * columns * pixels)
 
 
 @pytest.mark.parametrize("rows", [1, 2])

@@ -22,7 +22,7 @@ from plenocli.forward.propagation.response import (
     valid_for,
 )
 from plenocli.forward.scene.white_reference import REFERENCE_REFLECTANCE
-from plenocli.forward.sensor.exposure import exposure_scale
+from plenocli.forward.sensor.exposure.recorder import exposure_scale
 
 if TYPE_CHECKING:
     from plenocli.forward.camera.model import Camera

@@ -25,7 +25,8 @@ from plenocli.forward.propagation.system_matrix import build_pif
 from plenocli.forward.scene.light import Quadrature
 from plenocli.forward.scene.sample import ALL
 from plenocli.forward.scene.scenes import Scene
-from plenocli.forward.sensor.exposure import ExposureOptions, SimulatedCapture, simulate_capture
+from plenocli.forward.sensor.exposure.options import ExposureOptions
+from plenocli.forward.sensor.exposure.simulate import SimulatedCapture, simulate_capture
 from plenocli.inverse.chain.chains import MatrixOption
 from plenocli.inverse.picture.estimate import estimate
 from plenocli.inverse.picture.estimators import Estimators, Options

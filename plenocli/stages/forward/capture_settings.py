@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from plenocli.forward.sensor.exposure import ExposureOptions
+from plenocli.forward.sensor.exposure.options import ExposureOptions
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -19,16 +19,18 @@ from plenocli.forward.camera.model import Sensor
 from plenocli.forward.propagation.accuracy_record import AccuracyRecord
 from plenocli.forward.scene.scenes import Chart, Scene, Uniform
 from plenocli.forward.scene.white_reference import REFERENCE_REFLECTANCE
-from plenocli.forward.sensor.exposure import (
-    SimulatedCapture,
+from plenocli.forward.sensor.exposure.matrices import (
     StoredField,
     StoredMatrix,
-    dark_capture,
     planned_accuracy,
+    stored_field,
+)
+from plenocli.forward.sensor.exposure.simulate import (
+    SimulatedCapture,
+    dark_capture,
     require_memory_for,
     require_tiling,
     simulate_capture,
-    stored_field,
 )
 from plenocli.stages.forward.capture_settings import CaptureSummary, Settings
 from plenocli.stages.forward.kept_matrices import KeptMatrices

@@ -14,14 +14,14 @@ import numpy as np
 
 import plenocli
 from plenocli.files.kept import is_kept, kept
-from plenocli.forward.sensor.exposure import (
+from plenocli.forward.sensor.exposure.matrices import (
     AnyMatrix,
-    ExposureOptions,
     StoredField,
     StoredMatrix,
     build_matrix,
     in_memory,
 )
+from plenocli.forward.sensor.exposure.options import ExposureOptions
 
 if TYPE_CHECKING:
     from plenocli.forward.camera.model import Camera

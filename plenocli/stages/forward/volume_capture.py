@@ -186,7 +186,7 @@ def _of_layers(
     """Opaque layers before a photographic camera, the nearest hiding those behind."""
     from plenocli.files.config.camera_file import to_toml
     from plenocli.files.read.cameras import read_camera
-    from plenocli.forward.sensor.exposure import require_tiling
+    from plenocli.forward.sensor.exposure.simulate import require_tiling
     from plenocli.forward.volume.cameras import optics_of_camera
     from plenocli.forward.volume.layers import record_layers
     from plenocli.forward.volume.plan import plan_volume
@@ -380,8 +380,9 @@ def _detected(
 ) -> tuple[Capture, float | None]:
     """What the sensor reports, and the share of its pixels over full well."""
     from plenocli.base.tiling import to_plane
+    from plenocli.forward.scene.white_reference import WHITE_LEVEL
     from plenocli.forward.sensor.capture import SuperpixelGrid
-    from plenocli.forward.sensor.exposure import WHITE_LEVEL, ExposureScale, recorded
+    from plenocli.forward.sensor.exposure.recorder import ExposureScale, recorded
 
     sensor = camera.sensor
     if not light.any():

@@ -133,7 +133,8 @@ def run_plan(camera_path: Path | str, scene: Path | str, settings: Settings) -> 
     from plenocli.forward.accuracy.scene_needs import sensor_noise
     from plenocli.forward.scene.light import broadband
     from plenocli.forward.scene.tables import illuminant
-    from plenocli.forward.sensor.exposure import ExposureOptions, require_tiling
+    from plenocli.forward.sensor.exposure.options import ExposureOptions
+    from plenocli.forward.sensor.exposure.simulate import require_tiling
     from plenocli.inverse.chain.chains import chains_of, matrix_options
     from plenocli.inverse.chain.choose import choose
     from plenocli.inverse.chain.rehearsal import Rehearsal

@@ -15,7 +15,9 @@ from plenocli.forward.accuracy.dial import pif_builder
 from plenocli.forward.scene.light import Quadrature, narrow_band
 from plenocli.forward.scene.scenes import Uniform
 from plenocli.forward.scene.white_reference import REFERENCE_REFLECTANCE
-from plenocli.forward.sensor.exposure import ExposureOptions, StoredMatrix, simulate_capture
+from plenocli.forward.sensor.exposure.matrices import StoredMatrix
+from plenocli.forward.sensor.exposure.options import ExposureOptions
+from plenocli.forward.sensor.exposure.simulate import simulate_capture
 from plenocli.inverse.calibration.measure import NarrowBands, calibrate
 from plenocli.inverse.spectra import neighbours
 from plenocli.inverse.spectra.bands import by_filter

@@ -13,7 +13,9 @@ from plenocli.forward.propagation.response import uniform_response
 from plenocli.forward.scene.light import Quadrature, narrow_band
 from plenocli.forward.scene.scenes import Polarised, Uniform
 from plenocli.forward.scene.white_reference import REFERENCE_REFLECTANCE
-from plenocli.forward.sensor.exposure import ExposureOptions, StoredMatrix, simulate_capture
+from plenocli.forward.sensor.exposure.matrices import StoredMatrix
+from plenocli.forward.sensor.exposure.options import ExposureOptions
+from plenocli.forward.sensor.exposure.simulate import simulate_capture
 from plenocli.inverse.calibration.measure import NarrowBands, calibrate
 from plenocli.inverse.spectra.bands import by_state, stokes
 from plenocli.inverse.spectra.demultiplexer import Demultiplexer

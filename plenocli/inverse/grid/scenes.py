@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from plenocli.base.errors import NumericsError
-from plenocli.inverse.grid import detect, distortion, lattice, template
+from plenocli.inverse.grid import detect, distortion, lattice, template, white_image
 from plenocli.inverse.grid.lenslet_grid import LensletGrid
 
 SCALES = (4, 8, 16, 32, 64)
@@ -42,7 +42,7 @@ def find_scene_grid(
     Raises as find_grid, and NumericsError where no period stands out of the scene.
     docs/model.md, section 9.
     """
-    pictures = [detect.prepare(capture, cfa) for capture in captures]
+    pictures = [white_image.prepare(capture, cfa) for capture in captures]
     period = _period([_without_colours(p, cfa) for p in pictures])
     pitch = _pitch(period)
     evened = np.mean([even_light(_without_colours(p, cfa), pitch) for p in pictures], axis=0)
@@ -87,7 +87,7 @@ def moved_grid(
     index, centres = np.argwhere(where), grid.centres[where]
     images = [
         np.mean(
-            [even_light(_without_colours(detect.prepare(p, cfa), cfa), pitch) for p in group],
+            [even_light(_without_colours(white_image.prepare(p, cfa), cfa), pitch) for p in group],
             axis=0,
         )
         for group in ([white], captures)
@@ -161,7 +161,7 @@ def _period(pictures: Sequence[np.ndarray]) -> lattice.Periodicity:
 
     found, reason = [], "no period is the same at two scales and in two directions"
     for picture in pictures:
-        part = np.maximum(detect.brightest_crop(picture, 1024), 0)
+        part = np.maximum(white_image.brightest_crop(picture, 1024), 0)
         logarithm = np.log(part + DARK * part.mean())
         for scale in SCALES:
             seen = lattice.find_basis(logarithm - gaussian_filter(logarithm, scale))
@@ -171,4 +171,4 @@ def _period(pictures: Sequence[np.ndarray]) -> lattice.Periodicity:
         alike = [one for one in found if abs(_pitch(one) - _pitch(best)) < AGREE * _pitch(best)]
         if len(alike) > len(pictures):
             return best
-    raise NumericsError(f"no lenslet lattice in the capture: {reason}", fix=detect.FIX)
+    raise NumericsError(f"no lenslet lattice in the capture: {reason}", fix=white_image.FIX)

@@ -151,7 +151,7 @@ class Draws:
         from plenocli.inverse.picture.estimate import estimate
         from plenocli.inverse.picture.lenslet_model import Superpixels
         from plenocli.inverse.picture.methods.registry import METHODS
-        from plenocli.stages.inverse.fitted_matrix import with_fitted_camera
+        from plenocli.stages.inverse.reconstruct.fitted_matrix import with_fitted_camera
 
         values, right, record, truth, y = captured
         sigma = float(np.sqrt(np.mean(y**2)) * 10 ** (-snr_db / 20))

@@ -139,7 +139,7 @@ def estimators_of(system, settings):
 
 def compare(args):
     """[{"lenslets", "scene", "snr_db", "seed", "method", ...}], one a run."""
-    from plenocli.stages.inverse.reconstruct import Settings
+    from plenocli.stages.inverse.reconstruct.recipe import Settings
 
     rows = []
     dictionaries = dict(zip(args.lenslets, args.dictionary or []))

@@ -16,7 +16,7 @@ from plenocli.base.errors import UsageError
 from plenocli.cli.main import run
 from plenocli.files.artefacts.container import Artefact, write_artefact
 from plenocli.inverse.picture.methods import per_lenslet
-from plenocli.stages.inverse import reconstruct
+from plenocli.stages.inverse.reconstruct import run as stage
 
 pytest.importorskip("distributed")
 pytestmark = pytest.mark.filterwarnings("default")  # what Dask's own threads warn of is not ours
@@ -346,13 +346,13 @@ def test_batches_of_the_lenslets_of_one_capture_give_the_bytes_of_one_process(
     # nine lenslets: five batches
     for name in ("NNLS_BATCH", "NNLS_CONVERGED_BATCH", "DICTIONARY_BATCH"):
         monkeypatch.setattr(per_lenslet, name, 2)
-    sent, noted, send = {}, [], reconstruct._solve_in_pool
+    sent, noted, send = {}, [], stage.solve_in_pool
 
     def sending(recipe, pool, solve, batches, options):
         noted.extend(batches)
         return send(recipe, pool, solve, batches, options)
 
-    monkeypatch.setattr(reconstruct, "_solve_in_pool", sending)
+    monkeypatch.setattr(stage, "solve_in_pool", sending)
     asked = ["reconstruct", "view.h5", "--pif", "pif.h5", "--method", *method]
     for name, options in {
         "here": [],

@@ -16,7 +16,7 @@ from plenocli.files.read.system_matrices import read_lenslet_matrix
 from plenocli.forward.sensor.noise import Noise
 from plenocli.inverse.picture.estimators import Estimators, Options
 from plenocli.inverse.picture.lenslet_model import Superpixels
-from plenocli.stages.inverse.fitted_matrix import with_fitted_camera
+from plenocli.stages.inverse.reconstruct.fitted_matrix import with_fitted_camera
 from tests.forward.propagation.cameras import small_camera
 
 KEYS = {

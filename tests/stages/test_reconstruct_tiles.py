@@ -14,7 +14,7 @@ from plenocli.cli.main import run
 from plenocli.evaluation.metrics.quality import psnr
 from plenocli.files.artefacts.container import read_artefact
 from plenocli.inverse.picture import tiles
-from plenocli.stages.inverse import reconstruct
+from plenocli.stages.inverse.reconstruct import in_tiles
 from tests.stages import test_reconstruct
 from tests.stages.test_reconstruct import N, make_files
 
@@ -109,7 +109,7 @@ def test_results_do_not_depend_on_workers(folder, tmp_path, small_tiles):
 def test_a_run_that_ended_goes_on_from_its_tiles(folder, tmp_path, small_tiles, monkeypatch):
     made, _ = folder
     picture(made / "alone", tmp_path / "right.h5", method="lmmse")
-    solved, solve = [], reconstruct._TileTask.__call__
+    solved, solve = [], in_tiles._TileTask.__call__
 
     def counted(self, job):
         if len(solved) == 3 and not resumed:
@@ -117,7 +117,7 @@ def test_a_run_that_ended_goes_on_from_its_tiles(folder, tmp_path, small_tiles, 
         solved.append(job[0])
         return solve(self, job)
 
-    monkeypatch.setattr(reconstruct._TileTask, "__call__", counted)
+    monkeypatch.setattr(in_tiles._TileTask, "__call__", counted)
     command = ["reconstruct", str(made / "alone/capture.h5"), "--pif", str(made / "alone/pif.h5")]
     command += ["--method", "lmmse", "-o", str(tmp_path / "out.h5")]
     resumed = False
@@ -171,13 +171,13 @@ def test_kill_9_loses_no_more_than_the_tiles_under_way(folder, tmp_path, monkeyp
         # what was whole before the kill is what it was, and tiles are there whole or not at all
         assert kept.items() <= known.items() and len(known) > len(kept)
         kept = known
-    solved, solve = [], reconstruct._TileTask.__call__
+    solved, solve = [], in_tiles._TileTask.__call__
 
     def counted(self, job):
         solved.append(job[0])
         return solve(self, job)
 
-    monkeypatch.setattr(reconstruct._TileTask, "__call__", counted)
+    monkeypatch.setattr(in_tiles._TileTask, "__call__", counted)
     assert run(command) == 0
     assert len(solved) == 16 - len(kept) and not {f"{n:06d}" for n in solved} & kept.keys()
     left = sorted(p.name for p in tmp_path.iterdir())

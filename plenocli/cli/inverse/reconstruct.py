@@ -183,7 +183,8 @@ def command(
           --hold-out 0.1 -o picture.h5
       plenocli reconstruct shots/*.NEF --calibration cal.h5 --method block-mean -o pictures/
     """
-    from plenocli.stages.inverse.reconstruct import Settings, run_reconstruct
+    from plenocli.stages.inverse.reconstruct.recipe import Settings
+    from plenocli.stages.inverse.reconstruct.run import run_reconstruct
 
     with options.partly_told(as_json):
         summary = run_reconstruct(

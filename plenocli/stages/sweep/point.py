@@ -349,7 +349,8 @@ def _joint(run: _Run) -> dict[str, float]:
 
 
 def _picture(run: _Run, capture: Path, pif: Path) -> dict[str, float]:
-    from plenocli.stages.inverse.reconstruct import Settings, run_reconstruct
+    from plenocli.stages.inverse.reconstruct.recipe import Settings
+    from plenocli.stages.inverse.reconstruct.run import run_reconstruct
 
     options = dict(run.task.options("reconstruct"))
     if dictionary := options.get("dictionary"):

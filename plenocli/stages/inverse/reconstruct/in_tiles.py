@@ -1,0 +1,182 @@
+"""The picture of a capture that is larger than a tile."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from plenocli.base.errors import PlenoError
+from plenocli.base.progress import bar, collected_notes, note
+from plenocli.execution.pool import Pool, run_all
+from plenocli.files.artefacts.provenance import file_digest
+from plenocli.files.read.captures import (
+    superpixel_source,
+)
+from plenocli.inverse.picture.estimate import estimate
+from plenocli.inverse.picture.estimators import Estimators
+from plenocli.inverse.picture.footprint import cleaned, require_reconstruction
+from plenocli.inverse.picture.lenslet_model import Superpixels, Whole
+from plenocli.inverse.picture.methods.method import Sees
+from plenocli.inverse.picture.methods.registry import METHODS
+from plenocli.inverse.picture.reconstruction import Reconstruction
+from plenocli.inverse.picture.tiles import (
+    NUISANCES,
+    Source,
+    Tile,
+    joined,
+    side_of,
+    spread_over,
+    survey,
+)
+from plenocli.stages.inverse.reconstruct.fitted_matrix import likely_cause
+from plenocli.stages.inverse.reconstruct.recipe import Recipe, estimators_of, finer_of
+from plenocli.stages.inverse.reconstruct.solved import Solved
+from plenocli.stages.inverse.reconstruct.tiles import Bench, SolvedTile, picture, solve_all
+
+if TYPE_CHECKING:
+    from plenocli.forward.accuracy.limiting_error import Limits
+
+
+def picture_in_tiles(
+    recipe: Recipe,
+    capture: Path,
+    source: Source,
+    tiles: Sequence[Tile],
+    pool: Pool,
+    target: Path,
+) -> Solved:
+    """The picture of a capture that is larger than a tile."""
+    settings, estimators = recipe.settings, estimators_of(recipe)
+    method, system = METHODS[settings.method], estimators.system
+    look = method.sees is not Sees.LENSLET_AS_IS
+    whole, middle = survey(system, source, side_of(system))
+    data = source.cut(*middle.own)
+    most = max(tiles, key=lambda t: np.prod([p.stop - p.start for p in t.around]))
+    require_reconstruction(
+        estimators,
+        source.cut(*most.around),
+        capture,
+        cleaned(method.phases) if look else method.phases,
+        joint=method.makes_joint_estimate(estimators),
+    )
+    limits, finer = limits_of(estimators, data), False
+    if look and limits is not None and limits.limited_by == "model":
+        better = finer_of(recipe)
+        finer, estimators = better is not None, better or estimators
+        limits = limits_of(estimators, data)
+    task = _TileTask(
+        recipe=recipe,
+        capture=capture,
+        finer=finer,
+        model_error=error_that_counts(limits),
+        whole=whole,
+    )
+    data, cause = replace(data, whole=whole), partial(likely_cause, estimators)
+    sample, seen = estimate(
+        estimators, method, data, model_error=error_that_counts(limits), explain=cause
+    )
+    all_weigh = METHODS[sample.method].weighs_all  # of the one that auto took
+    task = task.sharing(pool, tiles if all_weigh else spread_over(source.count, side_of(system)))
+    depends = replace(settings, workers=1), recipe.digests, file_digest(capture), tiles
+    bench = Bench.beside(target, depends)
+    clip = partial(np.maximum, 0) if settings.clip else np.asarray
+    stats = solve_all(pool, task, tiles, bench, clip)
+    value, sigma, counted = picture(bench, tiles, system.object_shape, max(1, len(system.bands)))
+    size = source.count[0] * source.count[1] * system.own.shape[0]
+    declared = data.saturated is not None
+    parts: dict[str, Any] = {"value": value, "sigma": sigma, "stats": stats or sample.stats}
+    trace = joined(sample, counted[1:], size, declared=declared)
+    for entry in trace:
+        if isinstance(entry, NUISANCES) and entry.found:
+            note(entry.sentence)
+    return Solved(
+        found=replace(sample, trace=trace, **parts),
+        seen=seen,
+        limits=limits,
+        negative_share=float(counted[0]) / np.prod(value.shape),
+        block=system.object_shape,
+        bands=system.bands,
+        bench=bench,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _TileTask:
+    """The task of a tile, in any process; what they share is made once a process.
+
+    finer: whether by a finer matrix of the camera.
+    model_error: of the matrix, see estimate.
+    whole: what is known of the capture.
+    """
+
+    recipe: Recipe
+    capture: Path
+    finer: bool
+    model_error: float
+    whole: Whole
+
+    def sharing(self, pool: Pool, pieces: Sequence[Tile]) -> _TileTask:
+        """The task that knows the whole, what `pieces` share beside the sample in it."""
+        found = {}
+        with bar(None, len(pieces), "what tiles share") as progress:
+            jobs = ((n, self.shared, piece) for n, piece in enumerate(pieces))
+            for number, own in run_all(pool, jobs):
+                if isinstance(own, PlenoError):
+                    raise own
+                found[number] = own
+                progress.update()
+        return replace(
+            self, whole=self.whole.closed_with([own for _, own in sorted(found.items())])
+        )
+
+    def shared(self, piece: Tile) -> Whole:
+        """What a piece adds to the means over pieces."""
+        own = self.whole.for_means()
+        self._estimated(piece, own)
+        return own.means()
+
+    def __call__(self, job: tuple[int, Tile]) -> SolvedTile:
+        """A tile."""
+        tile, found = job[1], self._estimated(job[1], self.whole)
+        sigma = None if found.sigma is None else found.sigma[tile.within]
+        value, trace = found.value[tile.within], found.trace
+        return SolvedTile(value=value, sigma=sigma, trace=trace, stats=found.stats)
+
+    def _estimated(self, tile: Tile, whole: Whole) -> Reconstruction:
+        """A piece; what there is to say was said of the whole."""
+        recipe = self.recipe
+        estimators = (finer_of(recipe) if self.finer else None) or estimators_of(recipe)
+        method, system = METHODS[recipe.settings.method], estimators.system
+        with collected_notes():
+            with superpixel_source(
+                self.capture, system, recipe.calibration, verify=False
+            ) as source:
+                data = replace(source.cut(*tile.around, tile.within), whole=whole)
+            return estimate(estimators, method, data, model_error=self.model_error)[0]
+
+
+def error_that_counts(limits: Limits | None) -> float:
+    """Error of the matrix that counts beside the noise."""
+    return 0.0 if limits is None or limits.limited_by == "noise" else limits.model_error
+
+
+def limits_of(estimators: Estimators, data: Superpixels) -> Limits | None:
+    """Whether the capture's noise or the error of the matrix decides, by their records; None where
+    that is not known.
+    """
+    from plenocli.forward.accuracy.limiting_error import what_limits
+
+    system, sigma = estimators.system, estimators.options.noise_sigma or data.sigma
+    known = data.y[np.isfinite(data.y)]
+    signal = float(np.sqrt(np.mean(np.square(known)))) if known.size else 0.0
+    return what_limits(
+        sigma / signal if sigma and signal else None,
+        system.accuracy,
+        data.accuracy,
+        data.pif_digest is not None and data.pif_digest == file_digest(system.path),
+    )

@@ -1,0 +1,230 @@
+"""The picture of one capture."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from plenocli.base.errors import InputError, UsageError
+from plenocli.base.progress import note
+from plenocli.base.tiling import to_blocks
+from plenocli.execution.pool import InProcess, Pool
+from plenocli.files.read.captures import (
+    read_white,
+    superpixel_source,
+)
+from plenocli.files.read.system_matrices import (
+    FieldMatrix,
+)
+from plenocli.inverse.calibration.calibration import there
+from plenocli.inverse.picture.diagnosis import Seen
+from plenocli.inverse.picture.estimate import estimate
+from plenocli.inverse.picture.estimators import Estimators
+from plenocli.inverse.picture.footprint import cleaned, require_reconstruction
+from plenocli.inverse.picture.lenslet_model import Superpixels
+from plenocli.inverse.picture.methods.method import Method, Sees
+from plenocli.inverse.picture.methods.registry import METHODS
+from plenocli.inverse.picture.reconstruction import Choice, Reconstruction
+from plenocli.inverse.picture.superpixels import windows_of
+from plenocli.inverse.picture.tiles import (
+    EVERY,
+    tiles_of,
+)
+from plenocli.stages.inverse.reconstruct.field_classes import estimate_by_class
+from plenocli.stages.inverse.reconstruct.fitted_matrix import likely_cause, with_fitted_camera
+from plenocli.stages.inverse.reconstruct.in_tiles import (
+    error_that_counts,
+    limits_of,
+    picture_in_tiles,
+)
+from plenocli.stages.inverse.reconstruct.recipe import (
+    Recipe,
+    Settings,
+    estimators_of,
+    field_of,
+    finer_of,
+)
+from plenocli.stages.inverse.reconstruct.solved import Solved
+
+if TYPE_CHECKING:
+    from plenocli.forward.accuracy.limiting_error import Limits
+
+
+def reconstruct_capture(
+    recipe: Recipe,
+    capture: Path,
+    *,
+    targets: Mapping[Path, Path],
+    pool: Pool | None = None,
+    far: bool = False,
+) -> Solved:
+    """The picture of one capture; what many captures need is made once a process.
+
+    targets: by the captures, the files beside which tiles may lie.
+    pool: for tiles, None for this process.
+    far: whether what lies there is not found by who writes the result.
+    """
+    settings = recipe.settings
+    if recipe.pif is None and recipe.calibration is not None:
+        choice = Choice(method="block-mean", reason="sum over the superpixel, over that of white")
+        value, rgb = _white_normalised(capture, recipe.calibration)
+        found = Reconstruction(value=value, method=choice.method, trace=(choice,))
+        return _solved(found, settings, rgb=rgb)
+    estimators, method = estimators_of(recipe), METHODS[settings.method]
+    system = estimators.system
+    with superpixel_source(
+        capture, system, recipe.calibration, each_pixel=method.each_pixel
+    ) as source:
+        tiles = tiles_of(estimators, method, source.count)
+        apart = len(tiles) > 1 and not settings.fit and settings.truth is None
+        if apart and field_of(recipe) is None and capture in targets and not far:
+            target = targets[capture]
+            return picture_in_tiles(recipe, capture, source, tiles, pool or InProcess(), target)
+        data = source.cut(*EVERY)
+    look = method.sees is not Sees.LENSLET_AS_IS
+    require_reconstruction(
+        estimators,
+        data,
+        capture,
+        cleaned(method.phases) if look else method.phases,
+        joint=method.makes_joint_estimate(estimators),
+    )
+    count = data.y.shape[:2]
+    truth = _truth(settings.truth, system.object_shape, count, max(1, len(system.bands)))
+    field, fitted = field_of(recipe), False
+    if settings.fit and field is not None:
+        raise UsageError(
+            "a camera is fitted by the matrix of one lenslet, not by those of a whole array",
+            "--fit",
+            "leave it out, or fit the camera first with fit-camera",
+        )
+    if settings.fit:
+        estimators, fit = with_fitted_camera(estimators, data, capture)
+        fitted = fit.accepted
+    limits = limits_of(estimators, data)
+    plain = (look or method.each_pixel) and not fitted and field is None
+    if plain and limits is not None and limits.limited_by == "model":
+        estimators = finer_of(recipe) or estimators
+        limits = limits_of(estimators, data)
+    found, seen = _estimate(field, estimators, method, data, truth, limits)
+    return _solved(
+        found.as_picture(system.object_shape),
+        settings,
+        seen=seen,
+        limits=limits,
+        block=system.object_shape,
+        bands=system.bands,
+    )
+
+
+def _estimate(
+    field: FieldMatrix | None,
+    estimators: Estimators,
+    method: Method,
+    data: Superpixels,
+    truth: np.ndarray | None,
+    limits: Limits | None,
+) -> tuple[Reconstruction, Seen | None]:
+    """The picture by one matrix, or by those of a whole array."""
+    off = error_that_counts(limits)
+    if field is None:
+        cause = partial(likely_cause, estimators)
+        return estimate(estimators, method, data, truth, model_error=off, explain=cause)
+    noise = 0.0 if limits is None else limits.noise
+    return estimate_by_class(
+        field,
+        estimators,
+        method,
+        data,
+        truth,
+        tolerance=max(noise, field.nodes.error),
+        model_error=off,
+    )
+
+
+def _solved(found: Reconstruction, settings: Settings, **more: Any) -> Solved:
+    picture = found.value
+    return Solved(
+        found=replace(found, value=np.maximum(picture, 0) if settings.clip else picture),
+        negative_share=float(np.mean(picture < 0)),
+        **more,
+    )
+
+
+def _truth(
+    path: Path | None, shape: tuple[int, int], count: tuple[int, ...], bands: int
+) -> np.ndarray | None:
+    """The true blocks (lenslet_row, lenslet_column, point) from a capture that holds its scene,
+    an image .h5 or an EXR; or None.
+    """
+    if path is None:
+        return None
+    path = Path(path)
+    if path.suffix == ".h5":
+        from plenocli.files.artefacts.container import read_artefact
+
+        artefact = read_artefact(path, ("capture", "image"))
+        picture = artefact.data.get("capture/scene", artefact.data.get("image/value"))
+    else:
+        from plenocli.files.images.pictures import read_picture
+
+        picture = np.moveaxis(read_picture(path).values, -1, 0)
+    if picture is None:
+        raise InputError("holds no scene", path, "give a simulated capture, or an image")
+    picture = np.asarray(picture, float)
+    picture = (
+        picture.mean(axis=0, keepdims=True)
+        if picture.ndim == 3 and bands == 1
+        else picture.reshape(-1, *picture.shape[-2:])
+    )
+    expected = (bands, count[0] * shape[0], count[1] * shape[1])
+    if picture.shape != expected:
+        raise InputError(
+            (
+                f"has {' x '.join(map(str, picture.shape))} bands, rows and columns of points, the "
+                f"picture {' x '.join(map(str, expected))}"
+            ),
+            path,
+            "give the object as sampled (capture-sim --scene-out)",
+        )
+    return to_blocks(picture, shape)
+
+
+def _white_normalised(capture: Path, calibration: Path) -> tuple[np.ndarray, np.ndarray | None]:
+    """One value a lenslet (lenslet_row, lenslet_column): the superpixel's sum over that of the
+    white reference; 0 where it cannot be had. Of pixels with colours also linear sRGB (3,
+    lenslet_row, lenslet_column), each colour's sum over its own of white.
+
+    Pixels that the calibration masked (dead, or under dust) are left out of both sums.
+    """
+    from plenocli.files.images.mosaic import read_capture
+    from plenocli.forward.sensor.cfa import cfa_map
+    from plenocli.forward.sensor.superpixel import extract
+
+    shot, known = read_capture(capture), read_white(calibration)
+    signal, white = windows_of(shot, known)
+    usable = np.isfinite(signal) & np.isfinite(white)
+
+    def share(counted: np.ndarray) -> np.ndarray:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.where(counted, signal, 0).sum(2) / np.where(counted, white, 0).sum(2)
+
+    value, rgb = share(usable), None
+    lost = ~np.isfinite(value)
+    if shot.cfa != "mono" and not set("RGB") - set(shot.cfa):
+        windows = there(known.windows)
+        colour = cfa_map((shot.shape[0], shot.shape[1]), shot.cfa)
+        places = [extract(colour == letter, windows.origin, windows.shape) == 1 for letter in "RGB"]
+        own = np.nan_to_num(np.stack([share(usable & place) for place in places]), posinf=0.0)
+        rgb = own if shot.profile is None else np.tensordot(shot.profile.to_rgb, own, axes=1)
+    if lost.any():
+        note(
+            f"{Path(capture).name}: {int(lost.sum())} of {lost.size} lenslets lie partly off the "
+            "sensor or are dark; they are 0 in the picture"
+        )
+    return np.where(lost, 0, value), rgb

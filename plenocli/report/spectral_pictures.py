@@ -26,7 +26,8 @@ from plenocli.report.drawing import (
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from plenocli.forward.camera.model import Camera, Filter
+    from plenocli.forward.camera.model import Camera
+    from plenocli.forward.camera.sections.filter_array import Filter
 
 
 def calibration_picture(

@@ -43,13 +43,14 @@ def read_transmittance(path: str | os.PathLike[str]) -> np.ndarray:
 
 
 def read_drawing(path: str | os.PathLike[str]) -> list[str]:
-    """Places of filters from a grey PNG, as plenocli.forward.camera.model.FilterArray draws them:
-    its levels above 0, from dark to bright, are the filters in their order; 0 is none.
+    """Places of filters from a grey PNG, as `drawing` of a FilterArray
+    (plenocli.forward.camera.sections.filter_array): its levels above 0, from dark to bright, are
+    the filters in their order; 0 is none.
 
     Returns a text for each row.
     Raises InputError.
     """
-    from plenocli.forward.camera.model import FILTER_SIGNS
+    from plenocli.forward.camera.sections.filter_array import FILTER_SIGNS
 
     _require_small(path)
     if file_type(path) != "png":

@@ -27,14 +27,15 @@ from plenocli.forward.camera.lens import (
     paraxial_image,
     wavefront,
 )
-from plenocli.forward.camera.model import noll_indices
 from plenocli.forward.camera.prescription import Prescription
 from plenocli.forward.camera.pupil import aperture_picture, unit_radius, zernike
 from plenocli.forward.camera.pupil import wavefront as wavefront_error
 from plenocli.forward.camera.raytrace import Rays, aim, entrance_pupil, trace
+from plenocli.forward.camera.sections.main_lens import noll_indices
 
 if TYPE_CHECKING:
-    from plenocli.forward.camera.model import Camera, FieldRow, MainLens
+    from plenocli.forward.camera.model import Camera
+    from plenocli.forward.camera.sections.main_lens import FieldRow, MainLens
 
 ON_AXIS: tuple[float, float] = (0.0, 0.0)
 TERMS = 66
@@ -104,7 +105,7 @@ def at_field(camera: Camera, wavelength: float, chief: tuple[float, float] = ON_
 
 def _turned(thin: MainLens, seen: _Seen, chief: tuple[float, float]) -> MainLens:
     """The thin lens with what is seen from a lenslet, turned to its azimuth."""
-    from plenocli.forward.camera.model import Aberration
+    from plenocli.forward.camera.sections.main_lens import Aberration
 
     height = math.hypot(*chief)
     down, right = (c / height for c in chief) if height else (0.0, 1.0)

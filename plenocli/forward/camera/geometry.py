@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING
 from plenocli.base.errors import ConfigError
 from plenocli.forward.camera.field import at_field
 from plenocli.forward.camera.glass import focal_length
-from plenocli.forward.camera.model import ROW_SPACING
 from plenocli.forward.camera.pupil import aperture_area, ray_reach
+from plenocli.forward.camera.sections.lenslet_array import ROW_SPACING
 
 if TYPE_CHECKING:
     import numpy as np

@@ -19,8 +19,11 @@ from plenocli.base.quantities import (
     planes_of,
 )
 from plenocli.base.units import format_length
-from plenocli.forward.camera.model import Aberration, Lattice, Light, Sensor
 from plenocli.forward.camera.plausible import unusual
+from plenocli.forward.camera.sections.lenslet_array import Lattice
+from plenocli.forward.camera.sections.light import Light
+from plenocli.forward.camera.sections.main_lens import Aberration
+from plenocli.forward.camera.sections.sensor import Sensor
 
 Planes = Annotated[
     tuple[SignedLength, ...],

@@ -22,13 +22,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from plenocli.base.errors import ConfigError
-from plenocli.forward.camera.model import FILTER_SIGNS, noll_indices
 from plenocli.forward.camera.quadrature import Cell
+from plenocli.forward.camera.sections.filter_array import FILTER_SIGNS
+from plenocli.forward.camera.sections.main_lens import noll_indices
 
 if TYPE_CHECKING:
     from scipy.interpolate import NdBSpline
 
-    from plenocli.forward.camera.model import Aberration, Camera, Filter, FilterArray, MainLens
+    from plenocli.forward.camera.model import Camera
+    from plenocli.forward.camera.sections.filter_array import Filter, FilterArray
+    from plenocli.forward.camera.sections.main_lens import Aberration, MainLens
 
 POLARISATIONS = "0 deg", "90 deg"
 """Two orthogonal states of light."""

@@ -22,7 +22,8 @@ from plenocli.forward.camera.quadrature import (
 
 if TYPE_CHECKING:
     from plenocli.forward.camera.geometry import Geometry
-    from plenocli.forward.camera.model import Camera, MainLens
+    from plenocli.forward.camera.model import Camera
+    from plenocli.forward.camera.sections.main_lens import MainLens
 
 
 def pupil_rows(camera: Camera, geometry: Geometry, slope: float) -> list[Rows]:

@@ -25,7 +25,8 @@ from plenocli.forward.propagation.lenslet_fields import LensletFields, PixelEner
 
 if TYPE_CHECKING:
     from plenocli.forward.camera.geometry import Geometry
-    from plenocli.forward.camera.model import Band, Camera
+    from plenocli.forward.camera.model import Camera
+    from plenocli.forward.camera.sections.light import Band
     from plenocli.forward.propagation.models import Model
     from plenocli.forward.propagation.plan import BandPlan, PifPlan
 

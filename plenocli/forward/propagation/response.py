@@ -33,7 +33,8 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from plenocli.forward.camera.geometry import Geometry
-    from plenocli.forward.camera.model import Camera, MainLens
+    from plenocli.forward.camera.model import Camera
+    from plenocli.forward.camera.sections.main_lens import MainLens
     from plenocli.forward.propagation.system_matrix import PifBuilder
 
 TAIL = 6

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from plenocli.base.errors import NumericsError
-from plenocli.forward.camera.model import noll_indices
 from plenocli.forward.camera.pupil import wavefront_slope
 from plenocli.forward.camera.quadrature import band_rule, nodes_for
+from plenocli.forward.camera.sections.main_lens import noll_indices
 from plenocli.forward.propagation.fresnel.paraxial_error import oblique_error
 from plenocli.forward.propagation.fresnel.spread_function import psf_nodes
 from plenocli.forward.propagation.fresnel.spread_terms import expected_terms

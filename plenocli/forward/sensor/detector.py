@@ -12,7 +12,8 @@ from plenocli.base.random_streams import stream
 from plenocli.forward.sensor.noise import Noise
 
 if TYPE_CHECKING:
-    from plenocli.forward.camera.model import Camera, Sensor
+    from plenocli.forward.camera.model import Camera
+    from plenocli.forward.camera.sections.sensor import Sensor
 
 ROUNDING = 1 / 12
 """Variance that rounding to whole numbers adds, DN^2."""

@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from plenocli.forward.camera.model import ROW_SPACING
 from plenocli.forward.camera.quadrature import gauss
+from plenocli.forward.camera.sections.lenslet_array import ROW_SPACING
 
 PUPIL_TERMS = 1e-7
 """Share of the largest angular harmonic of a pupil below which others are left out."""
@@ -150,7 +150,7 @@ class VolumeOptics:
     @property
     def round(self) -> bool:
         """Whether the field of a point depends on the distance from its image alone."""
-        from plenocli.forward.camera.model import noll_indices
+        from plenocli.forward.camera.sections.main_lens import noll_indices
 
         return all(noll_indices(term.noll)[1] == 0 for term in self.terms)
 

@@ -14,8 +14,8 @@ from functools import cached_property
 import numpy as np
 
 from plenocli.base.linear_maps import torus_for
-from plenocli.forward.camera.model import ROW_SPACING
 from plenocli.forward.camera.quadrature import gauss, nodes_for, opening_chords
+from plenocli.forward.camera.sections.lenslet_array import ROW_SPACING
 from plenocli.forward.volume.arriving import ArrivingField
 from plenocli.forward.volume.optics import VolumeOptics
 from plenocli.forward.volume.waves import near

@@ -15,7 +15,7 @@ from plenocli.base.progress import note
 from plenocli.base.tiling import InParts
 from plenocli.files.read.cameras import camera_files
 from plenocli.files.read.scenes import read_polarised, read_scene
-from plenocli.forward.camera.model import Sensor
+from plenocli.forward.camera.sections.sensor import Sensor
 from plenocli.forward.propagation.accuracy_record import AccuracyRecord
 from plenocli.forward.scene.scenes import Chart, Scene, Uniform
 from plenocli.forward.scene.white_reference import REFERENCE_REFLECTANCE

@@ -308,7 +308,8 @@ def matrix_key(task: Task, camera: Description, files: Mapping[str, str]) -> str
 
     files: path -> SHA-256 of the files it names.
     """
-    from plenocli.forward.camera.model import Light, Sensor
+    from plenocli.forward.camera.sections.light import Light
+    from plenocli.forward.camera.sections.sensor import Sensor
 
     if not task.needs_matrix:
         return ""

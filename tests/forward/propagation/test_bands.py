@@ -9,7 +9,7 @@ from scipy.integrate import quad
 from plenocli.base.errors import NumericsError
 from plenocli.forward.accuracy.dial import plan_pif
 from plenocli.forward.camera.geometry import geometry
-from plenocli.forward.camera.model import Band
+from plenocli.forward.camera.sections.light import Band
 from plenocli.forward.propagation.bands import (
     band_fields,
     node_count,

@@ -7,7 +7,6 @@ from scipy.special import j0, j1
 from plenocli.base.errors import ConfigError
 from plenocli.forward.camera.geometry import geometry
 from plenocli.forward.camera.glass import focal_length, refractive_index
-from plenocli.forward.camera.model import noll_indices
 from plenocli.forward.camera.pupil import (
     filter_cells,
     filter_transmittance,
@@ -15,6 +14,7 @@ from plenocli.forward.camera.pupil import (
 )
 from plenocli.forward.camera.pupil_quadrature import pupil_rows
 from plenocli.forward.camera.quadrature import cell_rows, disc_rows
+from plenocli.forward.camera.sections.main_lens import noll_indices
 from plenocli.forward.propagation.fresnel.spread_function import sampled_field, separable_field
 from tests.forward.propagation.cameras import WAVELENGTH, small_camera
 

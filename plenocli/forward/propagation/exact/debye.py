@@ -33,7 +33,8 @@ from plenocli.forward.propagation.fresnel.spread_function import mirrored
 
 if TYPE_CHECKING:
     from plenocli.forward.camera.geometry import Geometry
-    from plenocli.forward.camera.model import Camera, MainLens
+    from plenocli.forward.camera.model import Camera
+    from plenocli.forward.camera.sections.main_lens import MainLens
 
 APODISATION: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "uniform-pupil": lambda cos2: 1 / cos2,

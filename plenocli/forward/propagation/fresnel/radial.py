@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from plenocli.forward.camera.model import noll_indices
 from plenocli.forward.camera.pupil import (
     aperture_area,
     unit_radius,
@@ -24,6 +23,7 @@ from plenocli.forward.camera.pupil import (
     wavefront_slope,
 )
 from plenocli.forward.camera.quadrature import gauss, nodes_for
+from plenocli.forward.camera.sections.main_lens import noll_indices
 
 if TYPE_CHECKING:
     from plenocli.forward.camera.geometry import Geometry

@@ -39,7 +39,8 @@ from plenocli.forward.propagation.sampling import (
 
 if TYPE_CHECKING:
     from plenocli.forward.camera.geometry import Geometry
-    from plenocli.forward.camera.model import Camera, MainLens
+    from plenocli.forward.camera.model import Camera
+    from plenocli.forward.camera.sections.main_lens import MainLens
     from plenocli.forward.propagation.plan import PifPlan
 
 PupilMeasure = Callable[[np.ndarray, np.ndarray], np.ndarray]

@@ -19,7 +19,8 @@ from plenocli.forward.sensor.exposure.options import ExposureOptions
 from plenocli.forward.sensor.noise import Noise, white_noise
 
 if TYPE_CHECKING:
-    from plenocli.forward.camera.model import Camera, Sensor
+    from plenocli.forward.camera.model import Camera
+    from plenocli.forward.camera.sections.sensor import Sensor
     from plenocli.forward.scene.light import Quadrature
     from plenocli.forward.sensor.detector import SensorModel
 

@@ -11,14 +11,16 @@ import numpy as np
 from plenocli.base.budget import budget
 from plenocli.base.errors import NumericsError, PlenoError
 from plenocli.base.progress import note
-from plenocli.forward.accuracy.dial import plan_pif, seconds_here
+from plenocli.forward.accuracy.dial import plan_pif
 from plenocli.forward.camera.model import Camera
 from plenocli.forward.propagation.plan import PifPlan
 from plenocli.forward.propagation.system_matrix import build_pif
 from plenocli.inverse.picture.lenslet_model import LensletMatrix, gathered
 
 SECONDS = 60.0
-"""Time that a finer matrix may take without being asked for."""
+"""Time at nominal rates that a finer matrix may take without being asked for: the picture does not
+depend on how fast a machine is.
+"""
 FINEST = 1e-6
 
 
@@ -34,7 +36,7 @@ def finer_matrix(system: LensletMatrix) -> LensletMatrix | None:
         return None
     try:
         plan = _plan(system, origin.camera, origin.wavelengths, "exact")
-        if seconds_here(plan.chosen) > SECONDS or plan.memory > budget().memory / 2:
+        if plan.chosen.seconds() > SECONDS or plan.memory > budget().memory / 2:
             return None
         finer = _built(system, origin.camera, plan, origin.weights)
     except PlenoError:  # the matrix at hand serves, with its error

@@ -14,9 +14,11 @@ from pathlib import Path
 
 import numpy as np
 
-from plenocli.files.artefacts.container import Artefact, read_artefact, write_artefact
+from plenocli.files.artefacts.container import Artefact
 from plenocli.files.artefacts.provenance import file_digest
+from plenocli.files.artefacts.reading import read_artefact
 from plenocli.files.artefacts.shards import read_pif
+from plenocli.files.artefacts.writing import write_artefact
 from plenocli.files.atomic import publish
 from plenocli.files.config.camera_file import to_toml
 from plenocli.files.read.cameras import read_camera

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from plenocli.files.artefacts.container import read_artefact
+from plenocli.files.artefacts.reading import read_artefact
 from plenocli.files.artefacts.shards import read_pif
 from plenocli.files.atomic import publish
 from plenocli.files.config.camera_file import parse_camera

@@ -12,7 +12,7 @@ import pytest
 import plenocli as pc
 from plenocli.base.errors import NumericsError, UsageError
 from plenocli.cli.main import run
-from plenocli.files.artefacts.container import read_artefact
+from plenocli.files.artefacts.reading import read_artefact
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from plenocli.base.errors import InputError
-from plenocli.files.artefacts.container import Artefact, write_artefact
+from plenocli.files.artefacts.container import Artefact
 from plenocli.files.artefacts.provenance import Provenance
 from plenocli.files.artefacts.shards import read_pif
+from plenocli.files.artefacts.writing import write_artefact
 from plenocli.stages.evaluation.report import run_report
 
 PACKAGE = Path(__file__).resolve().parents[1] / "plenocli"

@@ -38,8 +38,8 @@ def open_file(file: Path | str) -> OpenedFile:
 
     Raises InputError where it is none.
     """
-    from plenocli.files.artefacts.container import opened_artefact
     from plenocli.files.artefacts.provenance import require_file
+    from plenocli.files.artefacts.reading import opened_artefact
     from plenocli.files.artefacts.shards import PIF_KINDS, read_pif
     from plenocli.files.images.exr import read_header
     from plenocli.files.images.mosaic import CAPTURE, is_hdf5

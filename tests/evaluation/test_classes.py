@@ -6,8 +6,9 @@ from scipy.stats import binomtest
 
 from plenocli.base.errors import InputError
 from plenocli.evaluation.metrics import classes
-from plenocli.files.artefacts.container import Artefact, write_artefact
+from plenocli.files.artefacts.container import Artefact
 from plenocli.files.artefacts.provenance import Provenance
+from plenocli.files.artefacts.writing import write_artefact
 from plenocli.files.read.class_table import read_labelled
 from plenocli.forward.scene.labelled import LabelledSpectra, SpectraChart
 

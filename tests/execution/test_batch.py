@@ -20,7 +20,8 @@ from plenocli.base.errors import InputError, PlenoError
 from plenocli.cli.main import run
 from plenocli.execution.batch import outcomes, plan_batch, summarise
 from plenocli.execution.pool import open_pool
-from plenocli.files.artefacts.container import Artefact, write_artefact
+from plenocli.files.artefacts.container import Artefact
+from plenocli.files.artefacts.writing import write_artefact
 from plenocli.files.read.captures import named_captures
 from plenocli.stages.inverse.calibrate import run_calibrate
 from plenocli.stages.inverse.demux import Settings, run_demux

@@ -14,7 +14,8 @@ import pytest
 
 from plenocli.base.errors import UsageError
 from plenocli.cli.main import run
-from plenocli.files.artefacts.container import Artefact, write_artefact
+from plenocli.files.artefacts.container import Artefact
+from plenocli.files.artefacts.writing import write_artefact
 from plenocli.inverse.picture.methods import per_lenslet
 from plenocli.stages.inverse.reconstruct import run as stage
 

@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from plenocli.files.artefacts.container import read_artefact, write_artefact
+from plenocli.files.artefacts.reading import read_artefact
+from plenocli.files.artefacts.writing import write_artefact
 from tests.faults.harness import Runner
 
 SAMPLES = Path(__file__).resolve().parents[2] / "sample_configs"

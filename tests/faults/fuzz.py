@@ -29,7 +29,7 @@ LIMITS = [
 
 def artefact(path, data):
     """Files as they come: the digest is in the way."""
-    from plenocli.files.artefacts.container import read_artefact
+    from plenocli.files.artefacts.reading import read_artefact
 
     path.write_bytes(data)
     read_artefact(path)
@@ -39,7 +39,8 @@ def sealed(path, data):
     """Files of someone who knows how to make a digest: links, filters, sizes and tables are all
     there is against them.
     """
-    from plenocli.files.artefacts.container import HEADER_BYTES, MAGIC, read_artefact
+    from plenocli.files.artefacts.container import HEADER_BYTES, MAGIC
+    from plenocli.files.artefacts.reading import read_artefact
 
     image = data[HEADER_BYTES:]
     head = MAGIC + f"sha256 {hashlib.sha256(image).hexdigest()}\nbytes {len(image)}\n".encode()

@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 import pytest
 
-from plenocli.files.artefacts.container import read_artefact
+from plenocli.files.artefacts.reading import read_artefact
 from tests.faults.harness import is_clean_refusal
 
 CAMERA = """
@@ -144,7 +144,7 @@ def test_captures_of_nothing_of_one_value_and_of_saturation_give_numbers(
     runner, stages, tmp_path, count, method
 ):
     """All-zero, constant, and clipped captures: a picture without NaN, or a refusal."""
-    from plenocli.files.artefacts.container import write_artefact
+    from plenocli.files.artefacts.writing import write_artefact
 
     source, _ = stages
     (tmp_path / "pif.h5").symlink_to(source / "pif.h5")

@@ -17,8 +17,8 @@ def test_codes_signals_and_hangs_are_told_apart(runner, stages):
 
 
 def test_every_kind_of_artefact_is_among_the_samples(stages):
-    from plenocli.files.artefacts.container import read_artefact
     from plenocli.files.artefacts.kinds import SCHEMAS
+    from plenocli.files.artefacts.reading import read_artefact
 
     folder, _ = stages
     kinds = {read_artefact(path).kind for path in folder.glob("*.h5")}

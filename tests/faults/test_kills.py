@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from plenocli.files.artefacts.container import read_artefact
+from plenocli.files.artefacts.reading import read_artefact
 from tests.faults.forked import Forks
 from tests.faults.harness import results, tree
 

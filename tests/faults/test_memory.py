@@ -21,8 +21,9 @@ import pytest
 from plenocli.base.memory import base_memory
 from plenocli.base.tiling import InParts
 from plenocli.cli.commands import COMMANDS, load_command
-from plenocli.files.artefacts.container import Artefact, write_artefact
+from plenocli.files.artefacts.container import Artefact
 from plenocli.files.artefacts.provenance import Provenance
+from plenocli.files.artefacts.writing import write_artefact
 from tests.faults.test_bombs import _png
 from tests.peak import PEAK
 
@@ -362,7 +363,7 @@ def test_hdf5_without_memory_is_no_damage(tmp_path):
     )
     code = (
         "import resource\n"
-        "from plenocli.files.artefacts.container import read_artefact\n"
+        "from plenocli.files.artefacts.reading import read_artefact\n"
         "used = int(open('/proc/self/statm').read().split()[5]) * resource.getpagesize()\n"
         "resource.setrlimit(resource.RLIMIT_DATA, (used + (30 << 20), used + (30 << 20)))\n"
         "try: read_artefact('capture.h5')\n"

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from plenocli.base.errors import InputError
-from plenocli.files.artefacts.container import read_artefact
 from plenocli.files.artefacts.kinds import SCHEMAS
+from plenocli.files.artefacts.reading import read_artefact
 from tests.faults.harness import mutants
 from tests.faults.test_resealed import MAGIC, attribute, other, resealed, values, without
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from plenocli.base.errors import InputError
-from plenocli.files.artefacts.container import read_artefact
+from plenocli.files.artefacts.reading import read_artefact
 from plenocli.files.images.exr import read_exr
 from plenocli.files.images.mosaic import read_capture
 from plenocli.files.images.pictures import read_picture

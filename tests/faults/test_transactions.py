@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from plenocli.base.errors import OutputError, UsageError
-from plenocli.files.artefacts.container import read_artefact, write_artefact
+from plenocli.files.artefacts.reading import read_artefact
+from plenocli.files.artefacts.writing import write_artefact
 from plenocli.files.atomic import check_output, publish, settle, staged_path, together
 from tests.faults.harness import is_clean_refusal, tree
 

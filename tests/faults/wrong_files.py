@@ -12,7 +12,8 @@ from unittest import mock
 import h5py
 import numpy as np
 
-from plenocli.files.artefacts.container import read_artefact, write_artefact
+from plenocli.files.artefacts.reading import read_artefact
+from plenocli.files.artefacts.writing import write_artefact
 from plenocli.files.images import dng
 from tests.faults import test_bombs as bombs
 from tests.faults.conftest import SAMPLES, SWEEP, write_shards

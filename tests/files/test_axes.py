@@ -5,15 +5,11 @@ import numpy as np
 import pytest
 
 from plenocli.base.errors import InputError
-from plenocli.files.artefacts.container import (
-    HEADER_BYTES,
-    Artefact,
-    read_artefact,
-    seal,
-    write_artefact,
-)
+from plenocli.files.artefacts.container import HEADER_BYTES, Artefact
 from plenocli.files.artefacts.kinds import SCHEMAS
 from plenocli.files.artefacts.provenance import Provenance
+from plenocli.files.artefacts.reading import read_artefact
+from plenocli.files.artefacts.writing import seal, write_artefact
 
 LENGTHS = {
     "band": 2,

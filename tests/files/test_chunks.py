@@ -9,9 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from plenocli.base.tiling import InParts
-from plenocli.files.artefacts import container
+from plenocli.files.artefacts import writing
 from plenocli.files.artefacts.chunks import FILTERS, fletcher32, write_chunks
-from plenocli.files.artefacts.container import Artefact, read_artefact, write_artefact
+from plenocli.files.artefacts.container import Artefact
+from plenocli.files.artefacts.reading import read_artefact
+from plenocli.files.artefacts.writing import write_artefact
 
 
 @pytest.fixture
@@ -87,7 +89,7 @@ def test_parts_of_any_size_make_the_bytes_of_the_whole(tmp_path_factory, data):
 
     whole = tmp_path_factory.mktemp("whole")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(container, "_CHUNK_BYTES", data.draw(st.integers(8, 3000)))
+        patch.setattr(writing, "_CHUNK_BYTES", data.draw(st.integers(8, 3000)))
         for name, image in (
             ("array.h5", values),
             ("parts.h5", InParts(shape=shape, dtype=np.float64, parts=parts)),

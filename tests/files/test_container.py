@@ -15,16 +15,11 @@ import pytest
 
 from plenocli.base.budget import Budget, within
 from plenocli.base.errors import InputError, NumericsError
-from plenocli.files.artefacts.container import (
-    HEADER_BYTES,
-    MAGIC,
-    Artefact,
-    cfa_text,
-    read_artefact,
-    write_artefact,
-)
+from plenocli.files.artefacts.container import HEADER_BYTES, MAGIC, Artefact, cfa_text
 from plenocli.files.artefacts.kinds import SCHEMAS
 from plenocli.files.artefacts.provenance import Provenance
+from plenocli.files.artefacts.reading import read_artefact
+from plenocli.files.artefacts.writing import write_artefact
 from tests.faults.harness import mutants
 
 
@@ -131,7 +126,7 @@ def test_same_input_gives_same_bytes_in_another_process_folder_zone_and_hash_see
     write_artefact(tmp_path / "here.h5", spectra())
     code = (
         "import sys; sys.path[:0] = [sys.argv[1], sys.argv[2]]; from test_container import "
-        "spectra; from plenocli.files.artefacts.container import write_artefact; "
+        "spectra; from plenocli.files.artefacts.writing import write_artefact; "
         "write_artefact('there.h5', spectra())"
     )
     root = os.path.abspath(os.path.join(os.path.dirname(__file__), "..", ".."))

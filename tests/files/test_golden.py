@@ -11,9 +11,11 @@ import numpy as np
 import pytest
 
 from plenocli.base.errors import InputError
-from plenocli.files.artefacts.container import Artefact, read_artefact, write_artefact
+from plenocli.files.artefacts.container import Artefact
 from plenocli.files.artefacts.kinds import SCHEMAS
 from plenocli.files.artefacts.provenance import Provenance
+from plenocli.files.artefacts.reading import read_artefact
+from plenocli.files.artefacts.writing import write_artefact
 
 GOLDEN = Path(__file__).resolve().parents[1] / "golden"
 

@@ -14,16 +14,13 @@ from plenocli.base.errors import InputError, NumericsError, OutputError, UsageEr
 from plenocli.base.tiling import InParts
 from plenocli.files import atomic
 from plenocli.files.artefacts import sparse
-from plenocli.files.artefacts.container import (
-    Artefact,
-    opened_artefact,
-    read_artefact,
-    write_artefact,
-)
+from plenocli.files.artefacts.container import Artefact
 from plenocli.files.artefacts.provenance import Provenance
+from plenocli.files.artefacts.reading import opened_artefact, read_artefact
 from plenocli.files.artefacts.shards import pif_parts, read_pif, shard_path, writing_pif
 from plenocli.files.artefacts.sparse import PAGE, SparseFile
 from plenocli.files.artefacts.stream import streamed_artefact
+from plenocli.files.artefacts.writing import write_artefact
 from tests.peak import PEAK
 
 SHAPE = (2, 3, 6, 4)

@@ -10,7 +10,9 @@ import pytest
 
 from plenocli.base.errors import InputError, NumericsError, OutputError, UsageError
 from plenocli.cli.main import run
-from plenocli.files.artefacts.container import Artefact, read_artefact, write_artefact
+from plenocli.files.artefacts.container import Artefact
+from plenocli.files.artefacts.reading import read_artefact
+from plenocli.files.artefacts.writing import write_artefact
 from plenocli.forward.sensor.detector import SensorModel
 from plenocli.stages.inverse.calibrate import run_calibrate
 from plenocli.stages.inverse.demux import Settings, run_demux

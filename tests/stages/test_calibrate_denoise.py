@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from plenocli.base.errors import NumericsError
-from plenocli.files.artefacts.container import Artefact, read_artefact, write_artefact
+from plenocli.files.artefacts.container import Artefact
+from plenocli.files.artefacts.reading import read_artefact
+from plenocli.files.artefacts.writing import write_artefact
 from plenocli.forward.sensor.detector import SensorModel
 from plenocli.stages.inverse.calibrate import run_calibrate
 from plenocli.stages.inverse.demux import Settings, run_demux

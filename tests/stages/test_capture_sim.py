@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 from plenocli.cli.main import run
-from plenocli.files.artefacts.container import Artefact, read_artefact, write_artefact
+from plenocli.files.artefacts.container import Artefact
 from plenocli.files.artefacts.provenance import Provenance
+from plenocli.files.artefacts.reading import read_artefact
+from plenocli.files.artefacts.writing import write_artefact
 from plenocli.files.config.camera_file import load_camera, parse_camera
 from plenocli.files.images.mosaic import read_capture
 from plenocli.forward.accuracy.dial import system_matrix

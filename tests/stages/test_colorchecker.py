@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from plenocli.cli.main import run
-from plenocli.files.artefacts.container import read_artefact
+from plenocli.files.artefacts.reading import read_artefact
 from plenocli.forward.scene.tables import colorchecker
 from plenocli.stages.evaluation.colorchecker import Settings, run_colorchecker, table
 from tests.reference.chart import paint_folder

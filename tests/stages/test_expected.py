@@ -9,7 +9,7 @@ import pytest
 
 from plenocli.base.errors import InputError, UsageError
 from plenocli.evaluation.metrics import classes
-from plenocli.files.artefacts.container import read_artefact
+from plenocli.files.artefacts.reading import read_artefact
 from plenocli.files.config.camera_file import load_camera
 from plenocli.files.images.mosaic import read_capture
 from plenocli.files.read.class_table import read_labelled

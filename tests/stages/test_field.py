@@ -8,7 +8,7 @@ import pytest
 from plenocli.base.errors import InputError
 from plenocli.base.tiling import to_blocks
 from plenocli.cli.main import run
-from plenocli.files.artefacts.container import read_artefact
+from plenocli.files.artefacts.reading import read_artefact
 from plenocli.files.artefacts.shards import read_field, read_pif
 from plenocli.files.config.camera_file import to_toml
 from tests.forward.propagation.cameras import small_camera

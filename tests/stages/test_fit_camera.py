@@ -10,7 +10,7 @@ from skimage import data
 
 from plenocli.base.tiling import to_blocks
 from plenocli.cli.main import run
-from plenocli.files.artefacts.container import read_artefact
+from plenocli.files.artefacts.reading import read_artefact
 from plenocli.files.config.camera_file import load_camera, to_toml
 from plenocli.files.read.system_matrices import read_lenslet_matrix
 from plenocli.forward.sensor.noise import Noise

@@ -11,8 +11,9 @@ from click.testing import CliRunner
 from plenocli.base.errors import InputError
 from plenocli.cli.evaluation.inspect import command
 from plenocli.cli.main import run
-from plenocli.files.artefacts.container import Artefact, write_artefact
+from plenocli.files.artefacts.container import Artefact
 from plenocli.files.artefacts.provenance import Provenance
+from plenocli.files.artefacts.writing import write_artefact
 from plenocli.files.images.dng import write_dng
 from plenocli.files.images.exr import write_exr
 from plenocli.files.images.spectral_exr import write_spectral_exr

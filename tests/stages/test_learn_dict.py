@@ -5,8 +5,9 @@ import pytest
 
 from plenocli.base.errors import InputError
 from plenocli.cli.main import run
-from plenocli.files.artefacts.container import Artefact, write_artefact
+from plenocli.files.artefacts.container import Artefact
 from plenocli.files.artefacts.provenance import Provenance
+from plenocli.files.artefacts.writing import write_artefact
 from plenocli.files.read.training import DEFAULT, read_training
 from plenocli.inverse.prior.natural_images import at_scales, split_by_scene
 
@@ -124,7 +125,7 @@ def test_same_seed_same_bytes_and_resume_in_place(pif, tmp_path):
 
 
 def test_interrupted_at_every_iteration_of_twenty_ends_with_the_same_dictionary(pif, tmp_path):
-    from plenocli.files.artefacts.container import read_artefact
+    from plenocli.files.artefacts.reading import read_artefact
 
     whole, part = tmp_path / "whole.h5", tmp_path / "part.h5"
     assert learn(pif, "--iterations", 20, "--synthesis", "-o", whole) == 0
@@ -172,7 +173,7 @@ def test_a_run_that_breaks_off_goes_on_from_its_checkpoint(pif, tmp_path, monkey
     capsys.readouterr()
     assert learn(pif, "--iterations", 6, "--checkpoint", kept, "-o", rest) == 0
     assert taken == [0, 1, 2, 3, 3, 4, 5] and not kept.exists()
-    from plenocli.files.artefacts.container import read_artefact
+    from plenocli.files.artefacts.reading import read_artefact
 
     one, other = (read_artefact(path, "dictionary") for path in (whole, rest))
     assert set(one.data) == set(other.data) and all(
@@ -297,7 +298,7 @@ def test_history_is_told_line_by_line(pif, tmp_path, capsys):
 
 
 def test_atoms_that_paint_are_kept_beside_those_that_code(pif, tmp_path):
-    from plenocli.files.artefacts.container import read_artefact
+    from plenocli.files.artefacts.reading import read_artefact
 
     assert learn(pif, "--iterations", 1, "--synthesis", "-o", tmp_path / "a.h5") == 0
     assert learn(pif, "--iterations", 1, "-o", tmp_path / "b.h5") == 0
@@ -352,7 +353,7 @@ def test_lambda_is_chosen_again_once_atoms_were_learnt(pif, tmp_path, capsys):
         assert run(asked) == 0
         said = capsys.readouterr().err
         assert said.count("lambda =") == (0 if name == "on" else 2)
-    from plenocli.files.artefacts.container import read_artefact
+    from plenocli.files.artefacts.reading import read_artefact
 
     whole, resumed = (read_artefact(tmp_path / f"{n}.h5", "dictionary") for n in ("long", "on"))
     assert whole.attrs["dictionary"]["lambda"] == resumed.attrs["dictionary"]["lambda"]

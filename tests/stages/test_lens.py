@@ -247,7 +247,7 @@ def test_the_system_matrix_is_that_of_the_thin_camera_which_the_rays_give(tmp_pa
     """simulate-pif on a camera with a lens file equals simulate-pif on one whose focal length
     and Noll terms are spelled out.
     """
-    from plenocli.files.artefacts.container import read_artefact
+    from plenocli.files.artefacts.reading import read_artefact
     from plenocli.files.config.camera_file import to_toml
 
     camera = camera_with_triplet(light__wavelengths=[450e-9], main_lens__aperture_diameter=4e-3)

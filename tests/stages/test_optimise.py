@@ -9,7 +9,7 @@ import pytest
 
 from plenocli.base.errors import ConfigError, UsageError
 from plenocli.cli.main import run
-from plenocli.files.artefacts.container import read_artefact
+from plenocli.files.artefacts.reading import read_artefact
 from plenocli.stages.sweep import optimise
 from plenocli.stages.sweep import store as sweep_store
 from plenocli.stages.sweep.task import PointResult

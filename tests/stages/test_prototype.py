@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from plenocli.cli.main import run
-from plenocli.files.artefacts.container import Artefact, read_artefact, write_artefact
+from plenocli.files.artefacts.container import Artefact
+from plenocli.files.artefacts.reading import read_artefact
+from plenocli.files.artefacts.writing import write_artefact
 from plenocli.forward.scene.tables import SIX_PATCHES, colorchecker, patch_index
 from plenocli.forward.sensor.detector import SensorModel
 from plenocli.inverse.spectra.radiance import estimate, light_prior

@@ -9,8 +9,10 @@ from plenocli.base.linear_maps import BlockToeplitz
 from plenocli.base.tiling import to_blocks, to_plane
 from plenocli.cli.main import run
 from plenocli.evaluation.metrics.quality import psnr
-from plenocli.files.artefacts.container import Artefact, read_artefact, write_artefact
+from plenocli.files.artefacts.container import Artefact
 from plenocli.files.artefacts.provenance import Provenance
+from plenocli.files.artefacts.reading import read_artefact
+from plenocli.files.artefacts.writing import write_artefact
 from plenocli.files.read.scenes import embedded_photograph
 from plenocli.forward.scene.sample import luminance, sample_picture
 

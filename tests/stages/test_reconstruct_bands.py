@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from plenocli.cli.main import run
-from plenocli.files.artefacts.container import read_artefact
+from plenocli.files.artefacts.reading import read_artefact
 from plenocli.files.images.spectral_exr import read_spectral_exr
 from plenocli.forward.scene.sample import block_mean
 
@@ -190,7 +190,7 @@ def test_the_truth_in_hindsight_has_bands_too(folder):
 def test_another_light_is_told(folder, tmp_path, capsys):
     capture = read_artefact(folder / "capture.h5", "capture")
     capture.attrs["capture"]["illuminant"] = "A"
-    from plenocli.files.artefacts.container import write_artefact
+    from plenocli.files.artefacts.writing import write_artefact
 
     write_artefact(tmp_path / "lamp.h5", capture)
     assert (

@@ -7,7 +7,8 @@ import pytest
 
 import plenocli as pc
 from plenocli.evaluation.metrics.quality import psnr
-from plenocli.files.artefacts.container import read_artefact, write_artefact
+from plenocli.files.artefacts.reading import read_artefact
+from plenocli.files.artefacts.writing import write_artefact
 from tests.stages.test_reconstruct import make_files, reconstruct
 
 SOME = ("lmmse", "tikhonov")

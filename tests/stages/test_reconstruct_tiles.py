@@ -12,7 +12,7 @@ import pytest
 from plenocli.base.errors import NumericsError
 from plenocli.cli.main import run
 from plenocli.evaluation.metrics.quality import psnr
-from plenocli.files.artefacts.container import read_artefact
+from plenocli.files.artefacts.reading import read_artefact
 from plenocli.inverse.picture import tiles
 from plenocli.stages.inverse.reconstruct import in_tiles
 from tests.stages import test_reconstruct

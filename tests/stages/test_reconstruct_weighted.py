@@ -7,7 +7,7 @@ import json
 import numpy as np
 
 from plenocli.cli.main import run
-from plenocli.files.artefacts.container import read_artefact
+from plenocli.files.artefacts.reading import read_artefact
 from tests.stages.test_reconstruct import make_files
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from plenocli.cli.main import run
-from plenocli.files.artefacts.container import read_artefact
+from plenocli.files.artefacts.reading import read_artefact
 from plenocli.inverse.lightfield.planes import distance_of, slope_of
 from plenocli.inverse.lightfield.refocus import STEP, sharpness
 

@@ -9,8 +9,8 @@ import pytest
 import tifffile
 
 from plenocli.cli.main import run
-from plenocli.files.artefacts.container import read_artefact
 from plenocli.files.artefacts.provenance import Provenance
+from plenocli.files.artefacts.reading import read_artefact
 from plenocli.files.images.exr import read_exr
 from plenocli.files.images.mosaic import write_capture
 from plenocli.files.images.tiff_stack import write_volume_tiff

@@ -7,8 +7,9 @@ import pytest
 
 from plenocli.base.errors import InputError, UsageError
 from plenocli.cli.main import run
-from plenocli.files.artefacts.container import Artefact, write_artefact
+from plenocli.files.artefacts.container import Artefact
 from plenocli.files.artefacts.provenance import Provenance, describe_inputs
+from plenocli.files.artefacts.writing import write_artefact
 from plenocli.files.images.exr import write_exr
 from plenocli.files.results.run_folder import RunFolder
 from plenocli.forward.scene.chart import chart_scene

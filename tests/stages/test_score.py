@@ -5,8 +5,9 @@ import pytest
 
 from plenocli.base.errors import InputError, UsageError
 from plenocli.cli.main import run
-from plenocli.files.artefacts.container import Artefact, write_artefact
+from plenocli.files.artefacts.container import Artefact
 from plenocli.files.artefacts.provenance import Provenance
+from plenocli.files.artefacts.writing import write_artefact
 from plenocli.forward.scene.chart import chart_labels, chart_scene
 from plenocli.stages.evaluation.score import run_score, table
 

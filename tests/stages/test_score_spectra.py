@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from plenocli.base.errors import InputError, UsageError
-from plenocli.files.artefacts.container import Artefact, write_artefact
+from plenocli.files.artefacts.container import Artefact
 from plenocli.files.artefacts.provenance import Provenance
+from plenocli.files.artefacts.writing import write_artefact
 from plenocli.files.config.camera_file import load_camera
 from plenocli.forward.scene.chart import chart_scene
 from plenocli.forward.scene.tables import colorchecker, illuminant

@@ -10,7 +10,7 @@ import pytest
 
 from plenocli.base.budget import Budget, within
 from plenocli.cli.main import run
-from plenocli.files.artefacts.container import read_artefact
+from plenocli.files.artefacts.reading import read_artefact
 from tests.peak import PEAK
 from tests.test_architecture import HEAVY
 

@@ -9,7 +9,7 @@ import pytest
 
 from plenocli.base.errors import ConfigError, InputError, UsageError
 from plenocli.cli.main import run
-from plenocli.files.artefacts.container import read_artefact
+from plenocli.files.artefacts.reading import read_artefact
 from plenocli.forward.scene.tables import camera_sensitivity
 from plenocli.forward.sensor.cfa import cfa_map
 from plenocli.stages.evaluation.score import run_score

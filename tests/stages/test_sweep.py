@@ -17,7 +17,7 @@ import pytest
 from plenocli.base.budget import Budget, within
 from plenocli.base.errors import ConfigError, InputError, OutputError, PlenoError, UsageError
 from plenocli.cli.sections import read_options
-from plenocli.files.artefacts.container import read_artefact
+from plenocli.files.artefacts.reading import read_artefact
 from plenocli.files.config.sweep_file import number
 from plenocli.stages.sweep import task as chain
 from plenocli.stages.sweep.point import run_point

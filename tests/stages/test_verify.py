@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from plenocli.base.errors import InputError, OutputError, UsageError
-from plenocli.files.artefacts.container import read_artefact
+from plenocli.files.artefacts.reading import read_artefact
 from plenocli.files.images.dng import write_dng
 from plenocli.files.images.mosaic import read_capture
 from plenocli.files.images.tiff_stack import read_tiff_volume, write_volume_tiff

@@ -14,7 +14,8 @@ from PIL import Image
 from plenocli.base.errors import ConfigError, InputError, NumericsError, OutputError, UsageError
 from plenocli.base.progress import collected_notes
 from plenocli.cli.sections import read_options
-from plenocli.files.artefacts.container import read_artefact, write_artefact
+from plenocli.files.artefacts.reading import read_artefact
+from plenocli.files.artefacts.writing import write_artefact
 from plenocli.files.images.mosaic import read_capture
 from plenocli.files.images.tiff_stack import read_tiff_volume, write_volume_tiff
 from plenocli.files.results.stacks import read_stack

@@ -19,9 +19,11 @@ import numpy as np
 from plenocli.base.budget import budget
 from plenocli.base.errors import InputError
 from plenocli.base.text import by
-from plenocli.files.artefacts.container import Artefact, read_artefact, write_artefact
+from plenocli.files.artefacts.container import Artefact
 from plenocli.files.artefacts.provenance import Provenance, file_digest
+from plenocli.files.artefacts.reading import read_artefact
 from plenocli.files.artefacts.stream import streamed_artefact
+from plenocli.files.artefacts.writing import write_artefact
 from plenocli.files.atomic import check_output, staged_path, together
 from plenocli.files.config.camera_file import parse_camera, to_toml
 from plenocli.forward.accuracy.depth_planes import plane_weights

@@ -11,8 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from plenocli.files.artefacts.container import HEADER_BYTES, Artefact, Frame, _frame, seal
+from plenocli.files.artefacts.container import HEADER_BYTES, Artefact
 from plenocli.files.artefacts.kinds import SCHEMAS
+from plenocli.files.artefacts.writing import Frame, _frame, seal
 from plenocli.files.atomic import replacement, write_at
 
 

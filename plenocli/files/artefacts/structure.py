@@ -83,7 +83,7 @@ def survey(
 
 def window(path: str, name: str, part: list[int]) -> dict[str, np.ndarray]:
     """Rows and columns, first and last but one each, of a dataset's last two axes, by its name;
-    runs outside, as `container.compressed_values`.
+    runs outside, as `reading.compressed_values`.
     """
     top, bottom, left, right = part
     try:

@@ -27,7 +27,8 @@ from plenocli.forward.sensor.cfa import ColourProfile
 from plenocli.forward.sensor.noise import Noise
 
 if TYPE_CHECKING:
-    from plenocli.files.artefacts.container import Artefact, Stored
+    from plenocli.files.artefacts.container import Artefact
+    from plenocli.files.artefacts.reading import Stored
 
 CAPTURE = "plenocli:capture"  # EXR attribute: JSON of what a capture artefact has as attributes
 FURTHEST = 1e100
@@ -127,7 +128,7 @@ def stored_capture(path: str | Path, *, verify: bool = True) -> Iterator[StoredC
 
     Raises InputError.
     """
-    from plenocli.files.artefacts.container import opened_artefact
+    from plenocli.files.artefacts.reading import opened_artefact
 
     path = Path(path)
     if not is_hdf5(path):
@@ -152,7 +153,7 @@ def is_hdf5(path: str | Path) -> bool:
 
 
 def _from_artefact(path: Path) -> Capture:
-    from plenocli.files.artefacts.container import read_artefact
+    from plenocli.files.artefacts.reading import read_artefact
 
     artefact = read_artefact(path, "capture")
     return _capture_of(path, artefact, artefact.data["capture/mosaic"])
@@ -359,7 +360,8 @@ def write_capture(
     path = Path(path)
     said = _attributes(capture)
     if path.suffix == ".h5":
-        from plenocli.files.artefacts.container import Artefact, write_artefact
+        from plenocli.files.artefacts.container import Artefact
+        from plenocli.files.artefacts.writing import write_artefact
 
         data = {
             "mosaic": capture.mosaic,

@@ -9,8 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from plenocli.files.artefacts.container import Artefact, read_artefact, write_artefact
+from plenocli.files.artefacts.container import Artefact
 from plenocli.files.artefacts.provenance import Provenance, provenance_texts, read_provenance_texts
+from plenocli.files.artefacts.reading import read_artefact
+from plenocli.files.artefacts.writing import write_artefact
 from plenocli.files.images.spectral_exr import read_spectral_exr, write_spectral_exr
 from plenocli.inverse.spectra.spectra import Spectra
 

@@ -159,7 +159,7 @@ def superpixel_source(
     """As read_superpixels, but that those of a simulated capture stay in its file until they are
     asked for.
 
-    verify: as of plenocli.files.artefacts.container.opened_artefact.
+    verify: as of plenocli.files.artefacts.reading.opened_artefact.
     """
     if calibration is None:
         with stored_capture(path, verify=verify) as stored:

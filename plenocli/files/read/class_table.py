@@ -74,7 +74,7 @@ def _table(path: Path) -> LabelledSpectra:
 
 def _image(path: Path, label: str) -> LabelledSpectra:
     """The pixels of a spectral image, that have values in all bands, as spectra of one class."""
-    from plenocli.files.artefacts.container import read_artefact
+    from plenocli.files.artefacts.reading import read_artefact
     from plenocli.files.images.pictures import read_picture
 
     if path.suffix == ".h5":

@@ -20,8 +20,8 @@ def read_dictionary(path: Path, system: LensletMatrix) -> Dictionary:
 
     Raises InputError where the atoms have another number of points than the matrix, or are one.
     """
-    from plenocli.files.artefacts.container import read_artefact
     from plenocli.files.artefacts.provenance import file_digest
+    from plenocli.files.artefacts.reading import read_artefact
 
     artefact = read_artefact(path, "dictionary")
     atoms = np.asarray(artefact.data["dictionary/atoms"], float)
@@ -77,8 +77,8 @@ def read_unfinished(path: Path, system: LensletMatrix, *, kept: bool) -> Unfinis
 
     Raises InputError where it belongs to another system matrix, or lacks what a resumed run needs.
     """
-    from plenocli.files.artefacts.container import read_artefact
     from plenocli.files.artefacts.provenance import file_digest
+    from plenocli.files.artefacts.reading import read_artefact
 
     artefact = read_artefact(path, "checkpoint" if kept else ("dictionary", "checkpoint"))
     if artefact.provenance.inputs.get("pif", {}).get("sha256") != file_digest(system.path):

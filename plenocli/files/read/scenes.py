@@ -39,7 +39,7 @@ def read_scene(
         return Chart()
     if str(name).startswith(EMBEDDED):
         return Photograph(embedded_photograph(str(name).removeprefix(EMBEDDED)), sampling, spectral)
-    from plenocli.files.artefacts.container import read_artefact
+    from plenocli.files.artefacts.reading import read_artefact
     from plenocli.files.images.pictures import read_picture
 
     path = Path(name)

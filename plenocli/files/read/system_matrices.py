@@ -62,7 +62,7 @@ def read_field_matrix(path: Path, *, by_band: bool = False) -> FieldMatrix | Non
 
     Raises InputError as read_lenslet_matrix.
     """
-    from plenocli.files.artefacts.container import opened_artefact, read_artefact
+    from plenocli.files.artefacts.reading import opened_artefact, read_artefact
     from plenocli.files.artefacts.shards import PIF_KINDS, read_field
 
     with opened_artefact(path, PIF_KINDS, ("pif/A",), verify=False) as (artefact, _):

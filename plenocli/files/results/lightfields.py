@@ -70,7 +70,7 @@ def write_lightfield(
     Raises UsageError, OutputError.
     """
     if path.suffix == ".h5":
-        from plenocli.files.artefacts.container import write_artefact
+        from plenocli.files.artefacts.writing import write_artefact
 
         write_artefact(path, lightfield_artefact(field, samples, provenance), overwrite=overwrite)
     elif path.suffix == ".exr":

@@ -19,7 +19,8 @@ from plenocli.files.results.volumes import StoredVolume, volume_of
 from plenocli.inverse.lightfield.planes import LightField
 
 if TYPE_CHECKING:
-    from plenocli.files.artefacts.container import Artefact, Stored
+    from plenocli.files.artefacts.container import Artefact
+    from plenocli.files.artefacts.reading import Stored
 
 PICTURES = ("image", "spectra", "dictionary")
 SCORED = (*PICTURES, "calibration", "lightfield", "volume")
@@ -48,7 +49,7 @@ def read_response(path: Path | str) -> ComparedResponse:
 
     Raises InputError where it holds none.
     """
-    from plenocli.files.artefacts.container import read_artefact
+    from plenocli.files.artefacts.reading import read_artefact
 
     return _response_of(read_artefact(path, "calibration"), Path(path))
 
@@ -99,7 +100,7 @@ def read_result(path: Path | str, kinds: tuple[str, ...] = PICTURES) -> Result:
 
 def _opened(path: Path, kinds: tuple[str, ...]) -> "Artefact":
     """The artefact at a path, verified; the values of a picture are Stored."""
-    from plenocli.files.artefacts.container import opened_artefact
+    from plenocli.files.artefacts.reading import opened_artefact
 
     with opened_artefact(path, kinds, ("image/value", "image/sigma")) as (artefact, stored):
         return replace(artefact, data={**artefact.data, **stored})

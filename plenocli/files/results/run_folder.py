@@ -62,7 +62,7 @@ class RunFile:
 
     def artefact(self) -> "Artefact":
         """The artefact itself, verified."""
-        from plenocli.files.artefacts.container import read_artefact
+        from plenocli.files.artefacts.reading import read_artefact
 
         return self.kept if self.kept is not None else read_artefact(self.path, self.kind)
 
@@ -164,8 +164,8 @@ def _digests_of(inputs: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _survey_artefact(path: Path, name: str) -> RunFile:
-    from plenocli.files.artefacts.container import read_artefact
     from plenocli.files.artefacts.provenance import file_digest
+    from plenocli.files.artefacts.reading import read_artefact
 
     artefact = read_artefact(path)
     origin = artefact.provenance

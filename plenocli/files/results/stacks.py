@@ -36,7 +36,7 @@ def read_stack(path: Path | str) -> Stack:
 
     Raises InputError for another file, or one whose parts do not fit together.
     """
-    from plenocli.files.artefacts.container import read_artefact
+    from plenocli.files.artefacts.reading import read_artefact
 
     return stack_of(read_artefact(path, "pif-stack"), path)
 

@@ -145,7 +145,7 @@ def opened_truth(path: Path | str) -> "Artefact":
 
     Raises InputError for another kind.
     """
-    from plenocli.files.artefacts.container import opened_artefact
+    from plenocli.files.artefacts.reading import opened_artefact
 
     apart = ("capture/mosaic", "capture/scene", "image/value", "image/sigma")
     with opened_artefact(path, ("capture", "spectra", "image"), apart) as (artefact, stored):

@@ -132,7 +132,7 @@ def read_volume(path: Path | str) -> StoredVolume:
 
     Raises InputError for another file.
     """
-    from plenocli.files.artefacts.container import read_artefact
+    from plenocli.files.artefacts.reading import read_artefact
 
     return volume_of(read_artefact(path, "volume"))
 

@@ -46,8 +46,9 @@ def run_colorchecker(
     Raises InputError for the folder, NumericsError where a band shows no white patch or the paper
     does not tell the light, UsageError, OutputError.
     """
-    from plenocli.files.artefacts.container import Artefact, write_artefact
+    from plenocli.files.artefacts.container import Artefact
     from plenocli.files.artefacts.provenance import Provenance, describe_inputs
+    from plenocli.files.artefacts.writing import write_artefact
     from plenocli.files.atomic import check_output, together
     from plenocli.files.results.scores import json_pieces
     from plenocli.files.seal import publish_sealed

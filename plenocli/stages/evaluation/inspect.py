@@ -54,8 +54,8 @@ def _unit(schema: Schema, where: str, name: str) -> str:
 
 
 def _artefact(path: Path) -> ArtefactReport:
-    from plenocli.files.artefacts.container import read_artefact
     from plenocli.files.artefacts.kinds import SCHEMAS
+    from plenocli.files.artefacts.reading import read_artefact
 
     artefact = read_artefact(path)
     schema, origin = SCHEMAS[artefact.kind], artefact.provenance

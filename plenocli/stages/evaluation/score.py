@@ -372,7 +372,7 @@ def _score_planes(path: Path | str, field: LightField, comparison: _Comparison) 
 
 def _layers(truth: Path | str | None) -> StoredVolume | None:
     """Opaque layers, where the truth is a file of them."""
-    from plenocli.files.artefacts.container import read_artefact
+    from plenocli.files.artefacts.reading import read_artefact
 
     if truth is None or Path(truth).suffix != ".h5":
         return None
@@ -417,7 +417,7 @@ def _score_volume(path: Path | str, volume: StoredVolume, comparison: _Compariso
 def _distance(truth: Path | str | None, path: Path | str) -> float:
     """Of the plane that a refocused capture shows, m: as told, or as the simulated capture says."""
     from plenocli.base.units import UnitError, parse_length
-    from plenocli.files.artefacts.container import read_artefact
+    from plenocli.files.artefacts.reading import read_artefact
     from plenocli.files.config.camera_file import parse_camera
 
     if truth is None:
@@ -590,7 +590,7 @@ def _require_values(truth: Plane, where: Path | str | None) -> None:
 
 def _sensor_snr(path: Path | str) -> float:
     """Sensor-model SNR of a capture from its mosaic and the noise it says it got, dB."""
-    from plenocli.files.artefacts.container import opened_artefact
+    from plenocli.files.artefacts.reading import opened_artefact
 
     apart = ("capture/mosaic", "capture/scene")
     with opened_artefact(path, "capture", apart) as (capture, stored):

@@ -100,7 +100,8 @@ def _is_whole(path: Path) -> bool:
 
 
 def _seal_artefact(path: Path, was: Path | None) -> Sealed:
-    from plenocli.files.artefacts.container import read_artefact, read_edited, write_artefact
+    from plenocli.files.artefacts.reading import read_artefact, read_edited
+    from plenocli.files.artefacts.writing import write_artefact
     from plenocli.files.results.contents import artefact_contents, changes
 
     artefact, digest = read_edited(path)

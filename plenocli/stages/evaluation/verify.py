@@ -51,7 +51,7 @@ def run_verify(path: Path, *, signers: Path | None = None) -> Verified:
 
     Raises InputError naming what was altered or is missing, or where nothing says how it was.
     """
-    from plenocli.files.artefacts.container import read_artefact
+    from plenocli.files.artefacts.reading import read_artefact
     from plenocli.files.images.mosaic import is_hdf5
     from plenocli.files.seal import require_seal
 

@@ -388,7 +388,7 @@ def _read_pif(
     """(system matrices by wavelength, accuracy record) from a pif artefact; InputError where it
     belongs to another camera or lacks a wavelength.
     """
-    from plenocli.files.artefacts.container import read_artefact
+    from plenocli.files.artefacts.reading import read_artefact
     from plenocli.files.artefacts.shards import PIF_KINDS, read_field, read_pif, shapes_of
     from plenocli.files.config.camera_file import parse_camera
     from plenocli.files.read.cameras import require_same_files
@@ -450,8 +450,9 @@ def _write_scene(
     """The object as sampled, an `image` artefact or EXR: one picture, or one a band of
     [light] wavelengths.
     """
-    from plenocli.files.artefacts.container import Artefact, write_artefact
+    from plenocli.files.artefacts.container import Artefact
     from plenocli.files.artefacts.provenance import provenance_texts
+    from plenocli.files.artefacts.writing import write_artefact
     from plenocli.files.images.exr import write_exr
     from plenocli.files.images.spectral_exr import write_spectral_exr
 

@@ -394,7 +394,7 @@ def _write(task: _Task, job: _Job, output: Path | str) -> PifSummary:
     """Compute one matrix into its file."""
     from plenocli.base.budget import budget, one_thread, within
     from plenocli.files.artefacts import pif_pieces
-    from plenocli.files.artefacts.container import write_artefact
+    from plenocli.files.artefacts.writing import write_artefact
     from plenocli.forward.propagation.diagnosis import describe
     from plenocli.forward.propagation.system_matrix import build_pif
 

@@ -105,8 +105,8 @@ def run_simulate_stack(
     where memory or accuracy do not suffice, OutputError where the file cannot be written.
     """
     from plenocli.base.budget import Budget, budget, within
-    from plenocli.files.artefacts.container import write_artefact
     from plenocli.files.artefacts.provenance import Provenance, describe_inputs
+    from plenocli.files.artefacts.writing import write_artefact
     from plenocli.files.config.camera_file import to_toml
     from plenocli.files.config.microscope_file import load_microscope, microscope_toml
     from plenocli.files.results.stacks import stack_artefact

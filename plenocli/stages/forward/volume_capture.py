@@ -292,7 +292,7 @@ def _write_truth(
     path: str | Path, found: _Recorded, provenance: Provenance, overwrite: bool
 ) -> None:
     """What was recorded, as its artefact (.h5) or OME-TIFF."""
-    from plenocli.files.artefacts.container import write_artefact
+    from plenocli.files.artefacts.writing import write_artefact
     from plenocli.files.images.tiff_stack import write_volume_tiff
     from plenocli.files.results.volumes import truth_artefact
 

@@ -192,8 +192,8 @@ def _write_details(
     seed: int,
     overwrite: bool,
 ) -> None:
-    from plenocli.files.artefacts.container import write_artefact
     from plenocli.files.artefacts.provenance import Provenance, describe_inputs
+    from plenocli.files.artefacts.writing import write_artefact
     from plenocli.files.results.camera_fits import fit_artefact
 
     provenance = Provenance(command=command, inputs=describe_inputs(origin), seed=seed)

@@ -439,8 +439,9 @@ def _write(
     synthesis: atoms that paint.
     summary: None where the run goes on.
     """
-    from plenocli.files.artefacts.container import Artefact, write_artefact
+    from plenocli.files.artefacts.container import Artefact
     from plenocli.files.artefacts.provenance import Provenance, describe_inputs
+    from plenocli.files.artefacts.writing import write_artefact
 
     data = {"dictionary/atoms": state.atoms}
     data |= {} if synthesis is None else {"dictionary/synthesis": synthesis}

@@ -232,7 +232,7 @@ def _write(
     device: str | None,
 ) -> None:
     """The volume as artefact or OME-TIFF."""
-    from plenocli.files.artefacts.container import write_artefact
+    from plenocli.files.artefacts.writing import write_artefact
     from plenocli.files.images.tiff_stack import write_volume_tiff
     from plenocli.files.results.volumes import volume_artefact
 

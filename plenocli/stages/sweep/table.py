@@ -212,8 +212,8 @@ def finish(
 
     Raises the error of the first point where no point worked.
     """
-    from plenocli.files.artefacts.container import write_artefact
     from plenocli.files.artefacts.provenance import Provenance, describe_inputs
+    from plenocli.files.artefacts.writing import write_artefact
     from plenocli.files.atomic import publish, together
     from plenocli.files.results.design_tables import design_artefact
 

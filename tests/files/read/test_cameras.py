@@ -12,7 +12,7 @@ import pytest
 
 from plenocli.base.errors import ConfigError, InputError
 from plenocli.cli.main import run
-from plenocli.files.artefacts.container import read_artefact
+from plenocli.files.artefacts.reading import read_artefact
 from plenocli.files.config.camera_file import load_camera, to_toml
 from plenocli.files.images.exr import write_exr
 from plenocli.files.read.cameras import camera_files, read_camera

@@ -166,7 +166,7 @@ def _truth(
         return None
     path = Path(path)
     if path.suffix == ".h5":
-        from plenocli.files.artefacts.container import read_artefact
+        from plenocli.files.artefacts.reading import read_artefact
 
         artefact = read_artefact(path, ("capture", "image"))
         picture = artefact.data.get("capture/scene", artefact.data.get("image/value"))

@@ -62,7 +62,8 @@ def _in_memory(values: Any) -> Any:
 def _write_artefact(
     target: Path, solved: Solved, summary: PictureSummary, provenance: Provenance, overwrite: bool
 ) -> None:
-    from plenocli.files.artefacts.container import Artefact, write_artefact
+    from plenocli.files.artefacts.container import Artefact
+    from plenocli.files.artefacts.writing import write_artefact
 
     picture, sigma = solved.found.value, solved.found.sigma
     data = {"image/value": picture}

@@ -15,7 +15,7 @@ from plenocli.files.images.mosaic import read_capture
 from plenocli.files.read.class_table import read_labelled
 from plenocli.files.results.truths import through_filters
 from plenocli.forward.scene.labelled import SpectraChart
-from plenocli.stages.evaluation.score import run_score
+from plenocli.stages.evaluation.score.run import run_score
 from plenocli.stages.forward import capture_sim, simulate_pif, simulate_response
 from plenocli.stages.inverse import demux
 

@@ -14,7 +14,7 @@ from plenocli.files.images.exr import write_exr
 from plenocli.files.results.run_folder import RunFolder
 from plenocli.forward.scene.chart import chart_scene
 from plenocli.stages.evaluation.report import run_report
-from plenocli.stages.evaluation.score import run_score
+from plenocli.stages.evaluation.score.run import run_score
 from tests.reference import browser
 
 BANDS = np.array([450e-9, 540e-9, 570e-9, 650e-9])

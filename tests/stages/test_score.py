@@ -9,7 +9,7 @@ from plenocli.files.artefacts.container import Artefact
 from plenocli.files.artefacts.provenance import Provenance
 from plenocli.files.artefacts.writing import write_artefact
 from plenocli.forward.scene.chart import chart_labels, chart_scene
-from plenocli.stages.evaluation.score import run_score, table
+from plenocli.stages.evaluation.score.run import run_score, table
 
 BANDS = np.array([450e-9, 540e-9, 570e-9, 650e-9])
 

@@ -15,7 +15,7 @@ from plenocli.files.artefacts.writing import write_artefact
 from plenocli.files.config.camera_file import load_camera
 from plenocli.forward.scene.chart import chart_scene
 from plenocli.forward.scene.tables import colorchecker, illuminant
-from plenocli.stages.evaluation.score import run_score, table
+from plenocli.stages.evaluation.score.run import run_score, table
 
 BANDS = np.array([450e-9, 540e-9, 570e-9, 650e-9])
 CAMERA = Path(__file__).resolve().parents[2] / "sample_configs" / "demo_spectral.toml"

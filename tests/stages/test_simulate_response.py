@@ -12,7 +12,7 @@ from plenocli.cli.main import run
 from plenocli.files.artefacts.reading import read_artefact
 from plenocli.forward.scene.tables import camera_sensitivity
 from plenocli.forward.sensor.cfa import cfa_map
-from plenocli.stages.evaluation.score import run_score
+from plenocli.stages.evaluation.score.run import run_score
 from plenocli.stages.forward.capture_sim import Settings as Capture
 from plenocli.stages.forward.capture_sim import run_capture_sim
 from plenocli.stages.forward.simulate_response import Settings, run_simulate_response

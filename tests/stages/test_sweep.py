@@ -551,7 +551,7 @@ PAINTS = "nm,rust,moss,rust,moss\n400,0.06,0.05,0.08,0.06\n500,0.1,0.15,0.12,0.1
 
 def test_a_joint_point_has_picture_spectra_classes_cost_and_light(tmp_path):
     """All figures of one camera in one row, each what the stages say by hand; light halves."""
-    from plenocli.stages.evaluation.score import run_score
+    from plenocli.stages.evaluation.score.run import run_score
     from plenocli.stages.forward import capture_sim, simulate_pif, simulate_response
     from plenocli.stages.inverse import demux
 

@@ -21,7 +21,7 @@ from plenocli.files.images.tiff_stack import read_tiff_volume, write_volume_tiff
 from plenocli.files.results.stacks import read_stack
 from plenocli.files.results.volumes import read_volume
 from plenocli.inverse.volume.superpixels import white_superpixel
-from plenocli.stages.evaluation.score import run_score
+from plenocli.stages.evaluation.score.run import run_score
 from plenocli.stages.forward.capture_settings import Settings as Capture
 from plenocli.stages.forward.capture_sim import run_capture_sim
 from plenocli.stages.forward.simulate_pif import Settings, run_simulate_pif

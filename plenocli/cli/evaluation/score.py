@@ -188,7 +188,7 @@ def command(
       plenocli score planes.h5 --truth 620mm -o depth.json
       plenocli score image.h5 --truth capture.h5 -o -
     """
-    from plenocli.stages.evaluation.score import run_score, table
+    from plenocli.stages.evaluation.score.run import run_score, table
 
     printed = str(output) == "-"
     document = run_score(

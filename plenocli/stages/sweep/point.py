@@ -183,7 +183,7 @@ class _Run:
 
     def score(self, result: str, **truth: Any) -> dict[str, float]:
         """Figures of a result that are numbers."""
-        from plenocli.stages.evaluation.score import run_score
+        from plenocli.stages.evaluation.score.run import run_score
 
         options = dict(self.task.options("score"))
         names = [name for name in options if name in ("classes", "detect", "learnt")]

@@ -246,7 +246,8 @@ def _without(folder: Path, texts: Iterable[str]) -> tuple[str, ...]:
 
 
 def _simulate_pif(task: Task, folder: Path) -> MatrixCost:
-    from plenocli.stages.forward.simulate_pif import PifSummary, Settings, run_simulate_pif
+    from plenocli.stages.forward.pif_summary import PifSummary
+    from plenocli.stages.forward.simulate_pif import Settings, run_simulate_pif
     from plenocli.stages.forward.simulate_stack import StackSummary
 
     start = time.process_time()

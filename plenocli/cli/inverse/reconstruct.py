@@ -76,7 +76,7 @@ METHODS = (
 @click.option(
     "--alpha",
     type=options.NON_NEGATIVE,
-    help="Weight of |x|^2 for tikhonov; default by the discrepancy principle.",
+    help="Weight of squared detail for tikhonov; default by the discrepancy principle.",
 )
 @click.option(
     "--rank",

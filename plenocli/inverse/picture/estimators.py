@@ -39,7 +39,7 @@ class Options:
     overlap: superpixels (a side) looked at for each block, 1 or 3; None for 3 where the matrix
         knows neighbours.
     noise_sigma: standard deviation of the noise, in units of A x.
-    alpha: weight of |x|^2, in units of A's squared singular values.
+    alpha: weight of squared detail of tikhonov, in units of A's squared singular values.
     rank: directions kept.
     lam: weight of |c|_1, in the scaled problem of learn-dict.
     nnls_iterations: gradient steps after which to stop.

@@ -93,6 +93,28 @@ def test_every_method_gives_a_picture_and_its_account(name, coupled):
         assert set(told["trial_db"]) == {"lmmse", "pnp"} and found.method in told["trial_db"]
 
 
+@pytest.mark.parametrize("name, given", [("tikhonov", 1e-3), ("tikhonov", 1e9), ("tsvd", 4)])
+def test_regularised_least_squares_are_about_the_mean_of_each_lenslet(name, given):
+    """By stacked least squares and by a pseudo-inverse of numpy; a black lenslet stays black."""
+    estimators, data, _ = made(
+        False, method=name, **{"alpha" if name == "tikhonov" else "rank": given}
+    )
+    a, y = estimators.system.own, np.array(data.y)
+    y[0, 0] = 0
+    even = a.sum(axis=1)
+    means = (y @ even / (even @ even))[..., None] * np.ones(9)
+    left = y - means @ a.T
+    if name == "tsvd":
+        s = np.linalg.svd(a, compute_uv=False)
+        inverse = np.linalg.pinv(a, rcond=(s[3] + s[4]) / 2 / s[0])
+    else:
+        rows = np.concatenate([a, np.sqrt(given) * np.eye(9)])
+        inverse = np.linalg.lstsq(rows, np.eye(25)[:, :16], rcond=None)[0]
+    found = METHODS[name].reconstruct(estimators, replace(data, y=y))
+    np.testing.assert_allclose(found.value, means + left @ inverse.T, rtol=0, atol=1e-9)
+    assert not found.value[0, 0].any()
+
+
 def test_an_estimate_leaves_nothing_behind():
     """The same capture twice: nothing that the first found is in the second's account."""
     estimators, data, _ = made(True, method="tikhonov")

@@ -45,7 +45,9 @@ Solve = Callable[
 
 @dataclass(frozen=True, kw_only=True)
 class TikhonovStats(Record):
-    """alpha: weight of |x|^2, in units of A's squared singular values; rule: how it was chosen."""
+    """alpha: weight of squared detail, in units of A's squared singular values; rule: how it was
+    chosen.
+    """
 
     alpha: float
     rule: str
@@ -112,39 +114,58 @@ def block_mean(
     estimators: Estimators, y: np.ndarray, light: OwnLight, truth: np.ndarray | None
 ) -> tuple[np.ndarray, None]:
     """One value a lenslet and band."""
+    return _means(estimators, y), None
+
+
+def _means(estimators: Estimators, y: np.ndarray) -> np.ndarray:
+    """Means of the lenslets, at all points of a band alike, (point, signal)."""
     system = estimators.system
-    return np.repeat(system.levels(y.T).T, int(np.prod(system.object_shape)), axis=0), None
+    return np.repeat(system.levels(y.T).T, int(np.prod(system.object_shape)), axis=0)
+
+
+def _about_means(estimators: Estimators, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(means, z): means of the lenslets (point, signal), and what of y they leave, compressed, for
+    estimates of the detail alone. Estimates of all of the light are drawn towards black.
+    """
+    means = _means(estimators, y)
+    return means, estimators.svd.compress(y) - estimators.svd.shown(means)
 
 
 def tikhonov(
     estimators: Estimators, y: np.ndarray, light: OwnLight, truth: np.ndarray | None
 ) -> tuple[np.ndarray, TikhonovStats]:
-    """Weight given, by the discrepancy principle, or with hindsight."""
+    """Detail about the mean of each lenslet; weight given, by the discrepancy principle, or with
+    hindsight.
+    """
     svd, alpha, rule = estimators.svd, estimators.options.alpha, "given"
-    z = svd.compress(y)
+    means, z = _about_means(estimators, y)
     if alpha is None and truth is not None:
-        alpha, rule = least_squares.oracle_alpha(svd, z, truth), HINDSIGHT
+        alpha, rule = least_squares.oracle_alpha(svd, z, truth - means), HINDSIGHT
     elif alpha is None:
         power = light.data.common("power", lambda: least_squares.power_of(z[:, light.counted]))
         alpha = least_squares.discrepancy_alpha(svd, power, light.data.known_sigma)
         rule = "discrepancy"
-    return least_squares.tikhonov(svd, z, alpha), TikhonovStats(alpha=float(alpha), rule=rule)
+    found = means + least_squares.tikhonov(svd, z, alpha)
+    return found, TikhonovStats(alpha=float(alpha), rule=rule)
 
 
 def tsvd(
     estimators: Estimators, y: np.ndarray, light: OwnLight, truth: np.ndarray | None
 ) -> tuple[np.ndarray, TsvdStats]:
-    """Rank given, by the least estimated error, or with hindsight."""
+    """Detail about the mean of each lenslet; rank given, by the least estimated error, or with
+    hindsight.
+    """
     svd, rank, rule = estimators.svd, estimators.options.rank, "given"
-    z = svd.compress(y)
+    means, z = _about_means(estimators, y)
     if rank is None and truth is not None:
-        rank, rule = least_squares.oracle_rank(svd, z, truth), HINDSIGHT
+        rank, rule = least_squares.oracle_rank(svd, z, truth - means), HINDSIGHT
     elif rank is None:
         power = light.data.common("power", lambda: least_squares.power_of(z[:, light.counted]))
         rank = least_squares.best_rank(svd, power, light.data.known_sigma)
         rule = "least estimated error"
     rank = min(rank, svd.rank())
-    return least_squares.truncated(svd, z, rank), TsvdStats(rank=int(rank), rule=rule)
+    found = means + least_squares.truncated(svd, z, rank)
+    return found, TsvdStats(rank=int(rank), rule=rule)
 
 
 def nnls(

@@ -32,6 +32,10 @@ class Svd:
         """
         return self.u.T @ y
 
+    def shown(self, x: np.ndarray) -> np.ndarray:
+        """What of A x is compressed, (k, signal), from x (point, signal)."""
+        return self.s[:, None] * (self.vt @ x)
+
     def rank(self, relative: float | None = None) -> int:
         """Number of singular values above `relative` times the largest (default: machine precision
         times the larger side).

@@ -69,17 +69,10 @@ def picture_in_tiles(
         better = finer_of(recipe)
         finer, estimators = better is not None, better or estimators
         limits = limits_of(estimators, data)
-    task = _TileTask(
-        recipe=recipe,
-        capture=capture,
-        finer=finer,
-        model_error=error_that_counts(limits),
-        whole=whole,
-    )
+    off = error_that_counts(limits)
+    task = _TileTask(recipe=recipe, capture=capture, finer=finer, model_error=off, whole=whole)
     data, cause = replace(data, whole=whole), partial(likely_cause, estimators)
-    sample, seen = estimate(
-        estimators, method, data, model_error=error_that_counts(limits), explain=cause
-    )
+    sample, seen = estimate(estimators, method, data, model_error=off, explain=cause)
     all_weigh = METHODS[sample.method].weighs_all  # of the one that auto took
     task = task.sharing(pool, tiles if all_weigh else spread_over(source.count, side_of(system)))
     depends = replace(settings, workers=1), recipe.digests, file_digest(capture), tiles

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from plenocli.base.text import by
+from plenocli.forward.camera.geometry import geometry
 from plenocli.inverse.fit.ascent import Ascent, Point
-from plenocli.inverse.fit.problem import CapturedLenslets, fit_problem
+from plenocli.inverse.fit.problem import CapturedLenslets, FitProblem, fit_problem
 
 if TYPE_CHECKING:
     from plenocli.forward.camera.model import Camera
@@ -25,12 +28,23 @@ where light is off by more than its finest detail.
 """
 HELPS = 0.9
 """Times the noise that was likely before: a cause must explain so much."""
+SHOWN = 0.5
+"""Of what is left over beyond the noise, that finer points may leave at most to be the cause."""
+FINE, FINEST = 1.3, 40
+"""Points a side for each diffraction cell of a field, from which on finer ones show nothing more
+(docs/model.md); and as many as are tried, at most.
+"""
 
 
 def likeliest_cause(
-    camera: Camera, capture: CapturedLenslets, pictures: Sequence[np.ndarray], *, seed: int = 0
+    camera: Camera,
+    capture: CapturedLenslets,
+    pictures: Sequence[np.ndarray],
+    *,
+    seed: int = 0,
 ) -> str | None:
-    """Which parameter alone explains most of what the described camera does not, a sentence.
+    """What explains most of what the described camera does not, and what to do, a sentence: one of
+    its parameters alone, or detail of the objects that is finer than its points.
 
     By the slopes of the evidence and its curvature at the description, and one step along the
     parameters that promise most; some are tried either way. A hint and no measurement: paraxial,
@@ -38,13 +52,77 @@ def likeliest_cause(
 
     camera, capture, pictures, seed: as in fit_camera.
 
-    Returns None where no parameter helps.
+    Returns None where nothing helps.
     Raises as fit_camera does.
     """
+    cells = geometry(camera, camera.light.wavelengths[0]).diffraction_cells
+    if cells > FINEST and min(camera.object.samples_per_lenslet) < cells / 2:
+        return coarse_points(camera)  # no camera with such points explains anything
     problem = fit_problem(camera, [capture], pictures, lenslets=LENSLETS, seed=seed)
     family = problem.family
     ascent = Ascent(family, problem.evidence, tolerance=problem.tolerance)
     start = ascent.point(np.zeros(len(family.parameters)))
+    finer = _finely(camera)
+    left = math.inf
+    if finer is not None:
+        left = _left_over(fit_problem(finer, [capture], pictures, lenslets=LENSLETS, seed=seed))
+    place, at = _best_step(ascent, start)
+    if left - 1 > SHOWN * (start.factor - 1):
+        finer = None
+    if min(math.inf if finer is None else left, at.factor) > HELPS * start.factor:
+        return None
+    if finer is not None and left <= at.factor:
+        return (
+            f"objects have detail finer than {by(camera.object.samples_per_lenslet)} points a "
+            f"lenslet: by finer ones what is left over is {left:.2g} times the noise instead of "
+            f"{start.factor:.2g} ({_advised(finer.object.samples_per_lenslet)})"
+        )
+    return f"{_said(ascent, start, at, place)}; --fit finds the camera that fits"
+
+
+def coarse_points(camera: Camera) -> str | None:
+    """That points are fewer than a field's diffraction cells, and what to do, a sentence; None
+    where they are not. Nothing is measured.
+    """
+    cells = geometry(camera, camera.light.wavelengths[0]).diffraction_cells
+    known = camera.object.samples_per_lenslet
+    if min(known) >= cells:
+        return None
+    return (
+        f"the capture may show detail finer than {by(known)} points a lenslet, whose field holds "
+        f"{cells:.0f} diffraction cells each way ({_advised(_fine_points(camera))})"
+    )
+
+
+def _advised(points: tuple[int, int]) -> str:
+    rows, columns = points
+    return f"a pif with object.samples_per_lenslet = [{rows}, {columns}]"
+
+
+def _fine_points(camera: Camera) -> tuple[int, int]:
+    """Points (rows, columns) so fine that finer ones show nothing more."""
+    cells = geometry(camera, camera.light.wavelengths[0]).diffraction_cells
+    rows, columns = camera.object.samples_per_lenslet
+    least = math.ceil(FINE * cells)
+    return max(rows, least), max(columns, least)
+
+
+def _finely(camera: Camera) -> Camera | None:
+    """The camera with such points, or as fine as are tried; None where it has them."""
+    known = camera.object.samples_per_lenslet
+    samples = tuple(max(n, min(m, FINEST)) for n, m in zip(known, _fine_points(camera)))
+    return None if samples == known else camera.replace(**{"object.samples_per_lenslet": samples})
+
+
+def _left_over(problem: FitProblem) -> float:
+    """Times the noise told, what is likely to be left over by the described camera."""
+    ascent = Ascent(problem.family, problem.evidence, tolerance=problem.tolerance)
+    return ascent.point(np.zeros(len(problem.family.parameters))).factor
+
+
+def _best_step(ascent: Ascent, start: Point) -> tuple[int, Point]:
+    """(number of the parameter, the Point) of the step that leaves least; (-1, start) if none."""
+    family = ascent.family
     slopes = ascent.slopes(start)
     rise, curvature = slopes.rise, np.diag(slopes.curvature(start, start.factor))
     step = np.clip(rise / curvature, -FAR, FAR)
@@ -53,16 +131,19 @@ def likeliest_cause(
     for name, length in EITHER_WAY:
         if family.has(name):
             tries += [(family.place(name), side * length) for side in (-1, 1)]
-    best: tuple[Point, int] = (start, -1)
+    best = (-1, start)
     for place, length in tries:
         x = np.zeros(len(family.parameters))
         x[place] = length
         found = ascent.point(x)
-        if found.factor < best[0].factor:
-            best = (found, place)
-    at, place = best
-    if place < 0 or at.factor > HELPS * start.factor:
-        return None
+        if found.factor < best[1].factor:
+            best = (place, found)
+    return best
+
+
+def _said(ascent: Ascent, start: Point, at: Point, place: int) -> str:
+    """What a step along one parameter explains."""
+    family = ascent.family
     name, unit = family.parameters[place].name, family.parameters[place].unit
     before, after = float(family.start[place]), float(ascent.values(at.x)[place])
     moved = f"{after - before:+.2g} px"

@@ -284,10 +284,8 @@ def _settle(
 
 def _tell(belief: Belief, model_error: float, cause: str | None, *, coupled: bool) -> None:
     """A note of what speaks against the matrix, what may be the cause, and what was done."""
-    level, against, advice = belief.level, [], "--fit finds the camera that fits"
-    if cause is not None:
-        advice = f"{cause}; {advice}"
-    elif not coupled:
+    level, against, advice = belief.level, [], cause or "--fit finds the camera that fits"
+    if cause is None and not coupled:
         advice += "; neighbours' light takes a pif of --superpixels 3x3 and --overlap 3"
     if level.found is not None and level.found > level.sigma:
         against.append(f"what it cannot produce is {level.found / level.sigma:.3g} times the noise")

@@ -88,18 +88,20 @@ def _neighbours_count(system: LensletMatrix, data: Superpixels, sigma: float) ->
 def likely_cause(
     estimators: Estimators, y: np.ndarray, sigma: float, scene: str | None
 ) -> str | None:
-    """What is likely to be wrong with the camera of a pif, a sentence; None where that is not known
-    or the camera is of a kind that is not fitted.
+    """What is likely to be wrong with the camera of a pif, and what to do, a sentence; None where
+    that is not known or the camera is of a kind that is not fitted.
 
     y: (lenslet_row, lenslet_column, pixel); sigma: their noise; scene: that training leaves out.
     """
-    from plenocli.inverse.fit.causes import likeliest_cause
+    from plenocli.inverse.fit.causes import coarse_points, likeliest_cause
     from plenocli.inverse.fit.problem import CapturedLenslets
 
     origin = estimators.system.origin
-    if origin is None or estimators.coupled:
+    if origin is None:
         return None
     try:
+        if estimators.coupled:  # what is left of neighbours is no fit's to explain
+            return coarse_points(origin.camera)
         return likeliest_cause(
             origin.camera,
             CapturedLenslets(y, sigma),

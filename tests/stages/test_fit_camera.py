@@ -103,6 +103,22 @@ def test_a_fit_that_did_not_converge_writes_nothing(folder, capsys):
     assert said.out == "" and not out.exists()
 
 
+def test_points_that_are_too_coarse_are_told_from_a_camera_that_is_another(folder, capsys):
+    """By the fit and by the picture; the camera is the right one."""
+    coarse, pif, output = folder / "coarse.toml", folder / "coarse.h5", folder / "never.toml"
+    coarse.write_text(to_toml(small_camera(**KEYS | {"object__samples_per_lenslet": (4, 4)})))
+    capture = folder / "fine.h5"
+    made = ["capture-sim", str(coarse), *ALONE, "--refine", "3", "--snr", "50dB"]
+    assert run([*made, "--scene", "skimage:astronaut", "-o", str(capture)]) == 0
+    assert run(["simulate-pif", str(coarse), *ALONE, "-o", str(pif)]) == 0
+    capsys.readouterr()
+    assert run(["fit-camera", str(capture), "--camera", str(coarse), "-o", str(output)]) == 5
+    assert "finer than 4 x 4 points" in capsys.readouterr().err and not output.exists()
+    asked = ["reconstruct", str(capture), "--pif", str(pif), "--method", "lmmse"]
+    assert run([*asked, "-o", str(folder / "coarse-picture.h5")]) == 0
+    assert "finer than 4 x 4 points a lenslet" in capsys.readouterr().err
+
+
 def test_the_summary_as_json(folder, capsys):
     command = ["fit-camera", str(folder / "capture.h5"), "--camera", str(folder / "real.toml")]
     fixed = ["focus", "pitch", "wavelength", "lenslet focal length"]

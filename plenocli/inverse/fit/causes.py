@@ -11,7 +11,7 @@ import numpy as np
 from plenocli.base.text import by
 from plenocli.forward.camera.geometry import geometry
 from plenocli.inverse.fit.ascent import Ascent, Point
-from plenocli.inverse.fit.problem import CapturedLenslets, FitProblem, fit_problem
+from plenocli.inverse.fit.problem import CapturedLenslets, fit_problem
 
 if TYPE_CHECKING:
     from plenocli.forward.camera.model import Camera
@@ -62,22 +62,47 @@ def likeliest_cause(
     family = problem.family
     ascent = Ascent(family, problem.evidence, tolerance=problem.tolerance)
     start = ascent.point(np.zeros(len(family.parameters)))
-    finer = _finely(camera)
-    left = math.inf
-    if finer is not None:
-        left = _left_over(fit_problem(finer, [capture], pictures, lenslets=LENSLETS, seed=seed))
     place, at = _best_step(ascent, start)
-    if left - 1 > SHOWN * (start.factor - 1):
-        finer = None
-    if min(math.inf if finer is None else left, at.factor) > HELPS * start.factor:
-        return None
-    if finer is not None and left <= at.factor:
-        return (
-            f"objects have detail finer than {by(camera.object.samples_per_lenslet)} points a "
-            f"lenslet: by finer ones what is left over is {left:.2g} times the noise instead of "
-            f"{start.factor:.2g} ({_advised(finer.object.samples_per_lenslet)})"
-        )
+    detail = detail_beyond_points(
+        camera, [capture], pictures, left=at.factor, described=start.factor, seed=seed
+    )
+    if detail is not None or at.factor > HELPS * start.factor:
+        return detail
     return f"{_said(ascent, start, at, place)}; --fit finds the camera that fits"
+
+
+def detail_beyond_points(
+    camera: Camera,
+    captures: Sequence[CapturedLenslets],
+    pictures: Sequence[np.ndarray],
+    *,
+    left: float,
+    described: float,
+    seed: int = 0,
+) -> str | None:
+    """Whether objects have detail finer than the points of a camera, and what to do, a sentence;
+    None where finer points do not explain more than what else was found.
+
+    camera, captures, pictures, seed: as in fit_camera.
+    left, described: times the noise, what the best camera with these points leaves over, and what
+        the described one does.
+
+    Raises as fit_camera does.
+    """
+    finer = _finely(camera)
+    if finer is None:
+        return None
+    problem = fit_problem(finer, captures, pictures, lenslets=LENSLETS, seed=seed)
+    ascent = Ascent(problem.family, problem.evidence, tolerance=problem.tolerance)
+    found = ascent.point(np.zeros(len(problem.family.parameters))).factor
+    most = min(left, HELPS * described, 1 + SHOWN * (described - 1))
+    if found > most:
+        return None
+    return (
+        f"objects have detail finer than {by(camera.object.samples_per_lenslet)} points a lenslet: "
+        f"by finer ones what is left over is {found:.2g} times the noise instead of "
+        f"{described:.2g} ({_advised(finer.object.samples_per_lenslet)})"
+    )
 
 
 def coarse_points(camera: Camera) -> str | None:
@@ -112,12 +137,6 @@ def _finely(camera: Camera) -> Camera | None:
     known = camera.object.samples_per_lenslet
     samples = tuple(max(n, min(m, FINEST)) for n, m in zip(known, _fine_points(camera)))
     return None if samples == known else camera.replace(**{"object.samples_per_lenslet": samples})
-
-
-def _left_over(problem: FitProblem) -> float:
-    """Times the noise told, what is likely to be left over by the described camera."""
-    ascent = Ascent(problem.family, problem.evidence, tolerance=problem.tolerance)
-    return ascent.point(np.zeros(len(problem.family.parameters))).factor
 
 
 def _best_step(ascent: Ascent, start: Point) -> tuple[int, Point]:

@@ -187,11 +187,10 @@ def _of_rows(rows: Sequence[FieldRow], height: float, unit: float, focal_length:
             "main_lens.field",
             "add a row for the corner of the array",
         )
-    given = [{term.noll: term.coefficient for term in row.aberrations} for row in rows]
     terms = []
-    for j in sorted(set().union(*given)):
+    for j in sorted({term.noll for row in rows for term in row.aberrations}):
         power = 1 if noll_indices(j)[1] % 2 else 2
-        values = [row.get(j, 0.0) for row in given]
+        values = [row.coefficient(j) for row in rows]
         terms.append((j, float(np.interp(height**power, np.power(heights, power), values))))
     shift = float(np.interp(height, heights, [shift_of(row.transmission) for row in rows]))
     return _Seen(
@@ -243,14 +242,14 @@ def _traced(
             "write the lens's own, or scale the lens: plenocli lens import --focal-length",
         )
     focal_length = inside.focal_length(wavelength)
-    terms, rims = _off_axis(inside, wavelength, slope, aperture_diameter / 2)
+    terms, rims = _off_axis(inside, wavelength, slope)
     if slope == 0:
         terms = inside.aberrations(wavelength)
     return _Seen(focal_length=focal_length, terms=terms, rims=rims)
 
 
 def _off_axis(
-    inside: CameraLens, wavelength: float, slope: float, radius: float
+    inside: CameraLens, wavelength: float, slope: float
 ) -> tuple[tuple[tuple[int, float], ...], tuple[tuple[float, float], ...]]:
     """(Noll terms, rims) of a traced lens off the axis; arguments as _traced and _field_angle."""
     points, weights = disc_points(24, 48)
@@ -264,7 +263,7 @@ def _off_axis(
         paraxial_image(inside.lens, wavelength, inside.object_distance),
         clip=False,
     )
-    place = _pupil_places(wave.cosines, slope, inside.z2, radius, _rim_sine(inside, wavelength))
+    place, radius = inside.pupil_places(wave.cosines, wavelength, slope), inside.radius
     cosine = [j for j in range(2, TERMS + 1) if noll_indices(j)[1] >= 0]
     lit = np.isfinite(wave.error)
     if lit.sum() < 4 * len(cosine):
@@ -300,38 +299,6 @@ def _field_angle(inside: CameraLens, wavelength: float, slope: float) -> float:
         if abs(found / height - 1) < 1e-6:
             break
     return math.atan(tangent)
-
-
-def _rim_sine(inside: CameraLens, wavelength: float) -> float:
-    """Sine of the angle at which the ray through the stop's rim comes to the image on the axis."""
-    wave = wavefront(
-        inside.lens,
-        wavelength,
-        np.array([[0.0], [1.0]]),
-        object_distance=inside.object_distance,
-        image_distance=paraxial_image(inside.lens, wavelength, inside.object_distance),
-        clip=False,
-    )
-    return float(np.hypot(*wave.cosines[:, 0]))
-
-
-def _pupil_places(
-    cosines: np.ndarray, slope: float, z2: float, radius: float, rim: float
-) -> np.ndarray:
-    """Where the rays of a field go through the thin lens's pupil, (2, ray) m along a and b: the
-    points from which a lenslet at `slope` sees them as far from its chief ray, in direction cosines
-    and in units of the rim's on the axis.
-
-    cosines: (2, ray) x, y beside the chief ray's, y towards the lenslet;
-    radius: of the pupil, m;
-    rim: sine of the traced lens's rim on the axis.
-    """
-    upright = math.hypot(1, slope)
-    scale = radius / math.hypot(radius, z2) / rim
-    across, along = cosines[0] * scale, slope / upright + cosines[1] * scale
-    with np.errstate(invalid="ignore"):
-        forward = np.sqrt(1 - along**2 - across**2)
-    return z2 * np.stack([slope - along / forward, -across / forward])
 
 
 def _rims(

@@ -8,6 +8,7 @@ distances (m) from the last vertex. docs/model.md, "Real lenses".
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -434,25 +435,29 @@ def noll_coefficients(
 
 # in a camera
 
+_STOP_STEPS = 20
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, kw_only=True)
 class CameraLens:
     """A traced lens in the place of a camera's thin main lens, for one object distance and
-    aperture, on axis.
+    aperture.
 
-    Its principal planes stand for the thin lens; the beam is aperture_diameter wide there, so that
-    its paraxial half angle is D1/(2 z2).
+    Its principal planes stand for the thin lens. It is stopped down until its rim is seen from the
+    image on the axis as the thin lens's is, at the angle whose tangent is radius/z2.
 
     lens: stopped down;
     object_distance: m from the first vertex;
     z1: m from the object to the front principal plane;
-    z2: m from the rear one to the image at the design wavelength.
+    z2: m from the rear one to the image at the design wavelength;
+    radius: of the thin lens's pupil, m.
     """
 
     lens: Prescription
     object_distance: float
     z1: float
     z2: float
+    radius: float
 
     def focal_length(self, wavelength: float) -> float:
         """f1 (m) of the thin lens that focuses where this one does: 1/f1 = 1/z1 +
@@ -463,9 +468,33 @@ class CameraLens:
         shift = focal_shift(self.lens, [wavelength], self.object_distance)[0]
         return 1 / (1 / self.z1 + 1 / (self.z2 + shift))
 
+    def pupil_places(
+        self, cosines: np.ndarray, wavelength: float, slope: float = 0.0
+    ) -> np.ndarray:
+        """Where rays go through the thin lens's pupil: the points from which a lenslet sees them as
+        far from its chief ray, in direction cosines and in units of the rim's on the axis.
+
+        cosines: (2, ray) x, y beside the chief ray's, y towards the lenslet, as of a Wavefront;
+        wavelength: m, whose rim is the pupil's;
+        slope: of the lenslet's chief ray, tangent of the angle behind the rear principal point.
+
+        Returns (2, ray) m, towards the lenslet and across.
+        """
+        upright = math.hypot(1, slope)
+        scale = self.sine / _rim_sine(self.lens, wavelength, self.object_distance)
+        across, along = cosines[0] * scale, slope / upright + cosines[1] * scale
+        with np.errstate(invalid="ignore"):
+            forward = np.sqrt(1 - along**2 - across**2)
+        return self.z2 * np.stack([slope - along / forward, -across / forward])
+
+    @property
+    def sine(self) -> float:
+        """Of the angle at which the rim comes to the image on the axis."""
+        return self.radius / math.hypot(self.radius, self.z2)
+
     def aberrations(self, wavelength: float, order: int = 10) -> tuple[tuple[int, float], ...]:
-        """Defocus and spherical terms of W about this wavelength's own paraxial image; the focal
-        shift is in `focal_length`.
+        """Defocus and spherical terms of W on the axis about this wavelength's own paraxial image;
+        the focal shift is in `focal_length`.
 
         wavelength: m;
         order: highest radial order.
@@ -475,30 +504,21 @@ class CameraLens:
         """
         radial = [n * (n + 1) // 2 + 1 for n in range(2, order + 1, 2)]
         points, weights = disc_points(32, 1)
-        points = np.concatenate(
-            [np.stack([np.zeros(32), np.hypot(*points)]), [[0.0], [1.0]]], axis=1
-        )
         image = paraxial_image(self.lens, wavelength, self.object_distance)
         wave = wavefront(
             self.lens,
             wavelength,
-            points,
+            np.stack([np.zeros(32), np.hypot(*points)]),
             object_distance=self.object_distance,
             image_distance=image,
             clip=False,
         )
+        rho = np.hypot(*self.pupil_places(wave.cosines, wavelength)) / self.radius
         if not np.isfinite(wave.error).all():
-            raise NumericsError(
-                "rays at the rim of the aperture do not get through the lens",
-                "main_lens.prescription",
-                "use a smaller aperture",
-            )
-        rho = np.hypot(*wave.cosines) / np.hypot(*wave.cosines[:, -1])
-        basis = np.stack(
-            [np.ones(32), *(zernike(j, rho[:32], np.zeros(32)) for j in radial)], axis=1
-        )
+            raise _lost_rim()
+        basis = np.stack([np.ones(32), *(zernike(j, rho, np.zeros(32)) for j in radial)], axis=1)
         root = np.sqrt(weights)
-        found = np.linalg.lstsq(basis * root[:, None], wave.error[:32] * root, rcond=None)[0]
+        found = np.linalg.lstsq(basis * root[:, None], wave.error * root, rcond=None)[0]
         return tuple((j, float(c)) for j, c in zip(radial, found[1:]))
 
 
@@ -511,7 +531,8 @@ def camera_lens(
     aperture_diameter: that it is stopped down to, m;
     design_wavelength: m.
 
-    Raises ConfigError where the lens cannot be opened that far or forms no real image.
+    Raises ConfigError where the lens cannot be opened that far or forms no real image,
+    NumericsError where rays at the rim do not get through.
     """
     lens = replace(lens, design_wavelength=design_wavelength)
     data = first_order(lens, design_wavelength)
@@ -529,14 +550,61 @@ def camera_lens(
         )
     slope = data.entrance_pupil.radius / (from_vertex + data.entrance_pupil.position)
     widest = abs(slope) * object_distance * 2  # of the axial beam in the principal planes
-    if aperture_diameter > widest * 1.0001:
+    found = CameraLens(
+        lens=lens,
+        object_distance=from_vertex,
+        z1=object_distance,
+        z2=z2,
+        radius=aperture_diameter / 2,
+    )
+    return _stopped(found, lens.stop_radius * aperture_diameter / widest)
+
+
+def _stopped(inside: CameraLens, start: float) -> CameraLens:
+    """The lens with its stop as wide as its pupil asks for, found from a radius `start` (m)."""
+    lens, distance = inside.lens, inside.object_distance
+    full = _rim_sine(lens, lens.design_wavelength, distance)
+    if inside.sine > full * 1.0001:
+        opens = 2 * inside.z2 * full / math.sqrt(1 - full * full)
         raise ConfigError(
             (
-                f"the lens opens to {widest * 1e3:.5g} mm at most, not to "
-                f"{aperture_diameter * 1e3:.5g} mm"
+                f"the lens opens to {opens * 1e3:.5g} mm at most, not to "
+                f"{2 * inside.radius * 1e3:.5g} mm"
             ),
             "main_lens.aperture_diameter",
             "stop it down",
         )
-    stopped = replace(lens, stop_radius=lens.stop_radius * aperture_diameter / widest)
-    return CameraLens(stopped, from_vertex, object_distance, z2)
+    radius = min(start, lens.stop_radius)
+    for _ in range(_STOP_STEPS):
+        lens = replace(lens, stop_radius=radius)
+        ratio = inside.sine / _rim_sine(lens, lens.design_wavelength, distance)
+        if not abs(ratio - 1) > 1e-12:
+            break
+        radius *= ratio
+    if not math.isfinite(ratio):
+        raise _lost_rim()
+    return replace(inside, lens=lens)
+
+
+@functools.lru_cache(maxsize=1024)
+def _rim_sine(lens: Prescription, wavelength: float, object_distance: float) -> float:
+    """Sine of the angle at which the ray through the stop's rim comes to the image on the axis,
+    NaN where it does not.
+    """
+    wave = wavefront(
+        lens,
+        wavelength,
+        np.array([[0.0], [1.0]]),
+        object_distance=object_distance,
+        image_distance=paraxial_image(lens, wavelength, object_distance),
+        clip=False,
+    )
+    return float(np.hypot(*wave.cosines[:, 0]))
+
+
+def _lost_rim() -> NumericsError:
+    return NumericsError(
+        "rays at the rim of the aperture do not get through the lens",
+        "main_lens.prescription",
+        "use a smaller aperture",
+    )

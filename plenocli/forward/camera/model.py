@@ -160,9 +160,11 @@ class Camera(Section):
         reach = [(n - 1) / 2 * array.pitch for n in array.count]
         corner = math.hypot(reach[0] * array.row_spacing, reach[1])
         if rows and rows[-1].height < corner * (1 - 1e-9):
+            digits = 3 - math.floor(math.log10(corner))
+            enough = round(math.ceil(corner * 10**digits) / 10**digits, digits)
             raise ValueError(
                 f"main_lens.field ends at {format_length(rows[-1].height)} from the axis, the "
-                f"array at {format_length(corner)}: add a row for its corner"
+                f"array within {format_length(enough)}: add a row for its corner"
             )
 
     def _lengths(self) -> Lengths:

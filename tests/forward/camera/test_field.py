@@ -101,6 +101,13 @@ def test_rows_are_interpolated_and_turned_to_the_lenslet():
     assert at_field(camera, WAVELENGTH).main_lens.aberrations == ()
 
 
+def test_terms_of_one_index_add_up():
+    coma = {"noll": 8, "coefficient": 1e-8}
+    camera = wide(row(0.0, z4=1e-8), row(0.01) | {"aberrations": [coma, coma]})
+    lens = at_field(camera, WAVELENGTH, (0.0, 0.01)).main_lens
+    assert [(a.noll, a.coefficient) for a in lens.aberrations] == [(8, pytest.approx(2e-8))]
+
+
 def test_right_angles_keep_the_symmetry_exactly():
     camera = wide(row(0.0), row(0.01, 0.7, z8=2e-7, z6=1e-7, z10=1e-7))
     right, down = (at_field(camera, WAVELENGTH, c).main_lens for c in ((0.0, 4e-3), (4e-3, 0.0)))
@@ -117,6 +124,8 @@ def test_right_angles_keep_the_symmetry_exactly():
         ([row(0.0), row(0.0)], "must ascend from 0"),
         ([row(0.0), row(1e-4)], "main_lens.field ends at 100 um from the axis, the array"),
         ([row(0.0), row(0.01, z7=1e-9)], "Noll terms 7 are sines"),
+        ([row(0.0, z8=1e-9), row(0.01)], "the same in all directions"),
+        ([row(0.0, 0.9), row(0.01)], "the same in all directions"),
         ([row(0.0), row(0.01, 1.2)], "transmission"),
     ],
 )

@@ -283,7 +283,8 @@ def test_a_thin_lens_in_a_camera_is_itself():
     assert inside.z2 == pytest.approx(1 / (1 / f[550e-9] - 1), rel=1e-6)
     for w in f:
         assert inside.focal_length(w) == pytest.approx(f[w], rel=1e-6)
-    assert inside.lens.stop_radius == pytest.approx(3e-3, rel=1e-6)
+    # but for what spherical aberration bends the rim's ray more than paraxial ones
+    assert inside.lens.stop_radius == pytest.approx(3e-3, rel=3e-4)
 
 
 def test_a_traced_lens_in_a_camera_has_the_wavefront_of_its_rays():
@@ -307,7 +308,7 @@ def test_a_traced_lens_in_a_camera_has_the_wavefront_of_its_rays():
             )[0]
             * inside.z2
         )
-        assert unit == pytest.approx(4.5e-3, rel=2e-2)
+        assert unit == pytest.approx(4.5e-3 / math.hypot(1, 4.5e-3 / inside.z2), rel=3e-3)
         model = eps * (x * x + y * y) / 2 + sum(
             c * zernike(j, y / unit, x / unit) for j, c in inside.aberrations(w)
         )

@@ -69,7 +69,8 @@ class FieldRow(Section):
 
     transmission: share of a round pupil's area that rims leave open; the rest is beyond a disc of
         the pupil's size whose centre is moved away from the lenslet, as by a rim behind the lens.
-    aberrations: for a lenslet to the right of the axis (+x); they turn with its azimuth.
+    aberrations: for a lenslet to the right of the axis (+x); they turn with its azimuth. Terms of
+        one index add up.
     """
 
     height: Annotated[float, quantity(parse_length, "5 mm", 0.0, 1.0, format_length)]
@@ -85,6 +86,17 @@ class FieldRow(Section):
                 "about its axis does not have for a lenslet to the right of it"
             )
         return self
+
+    @property
+    def is_symmetric(self) -> bool:
+        """Whether the lens is the same in all directions."""
+        return self.transmission == 1 and all(
+            noll_indices(term.noll)[1] == 0 for term in self.aberrations if term.coefficient
+        )
+
+    def coefficient(self, noll: int) -> float:
+        """Of the term of that index, m."""
+        return sum(term.coefficient for term in self.aberrations if term.noll == noll)
 
 
 def _known_glass(name: str) -> str:
@@ -155,6 +167,11 @@ class MainLens(Section):
         heights = [row.height for row in self.field]
         if heights and (heights[0] != 0 or any(b <= a for a, b in zip(heights, heights[1:]))):
             raise ValueError("heights of field must ascend from 0 without repetition")
+        if self.field and not self.field[0].is_symmetric:
+            raise ValueError(
+                "the first row of field is the axis, where a lens is the same in all directions: no "
+                "transmission below 1, and only Noll terms without azimuth (4, 11, 22 ...)"
+            )
         if self.aperture_shape == "image" and any(row.transmission < 1 for row in self.field):
             raise ValueError(
                 'transmission below 1 is of a pupil with a rim, which aperture_shape = "image" '

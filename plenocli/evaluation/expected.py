@@ -186,7 +186,7 @@ def expected_score(
         class_distance_ideal=float(pixels.min()),
         detection_auc_expected=None
         if detect is None
-        else _detected(judged, found, classes, detect),
+        else _detected(judged, found, classes, detect, share),
     )
 
 
@@ -233,10 +233,11 @@ def _told(judged: _Judged, found: Estimates, classes: Classes) -> np.ndarray:
     return np.clip(1 - lost.sum(axis=1), 0.0, 1.0)
 
 
-def _detected(judged: _Judged, found: Estimates, classes: Classes, name: str) -> float:
+def _detected(
+    judged: _Judged, found: Estimates, classes: Classes, name: str, share: np.ndarray
+) -> float:
     """Expected area under the receiver operating characteristic of a score's filter."""
     known, reckoned = judged
-    weights = Filter.of(known, name, reckoned).weights
     real = found.gain @ classes.covariance @ found.gain.T + found.noise
     seen = classes.means @ found.gain.T + found.offset
-    return Filter.answering(Classes(classes.names, seen, real), name, real, weights).auc
+    return Filter.of(known, name, reckoned).auc(seen, real, share)

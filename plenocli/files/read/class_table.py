@@ -12,7 +12,11 @@ from plenocli.files.config.toml_file import read_text
 from plenocli.forward.scene.labelled import LabelledSpectra
 
 LARGEST = 1e30
-"""Of a spectrum, which is carried in single precision."""
+"""Of a pixel of an image, which is carried in single precision."""
+BRIGHTEST = 10.0
+"""Reflectance in a table, white being 1: what is fluorescent or shines back at the light may be
+above 1. Measured ones are below 0 by their noise at the most, a hundredth of it.
+"""
 WANTED = (
     "give a .csv whose first column are wavelengths in nm, and every other the reflectances of one "
     "spectrum below the name of its class; or a folder with a folder, a .csv or a spectral image "
@@ -48,15 +52,16 @@ def read_labelled(path: Path | str, bands: np.ndarray | None = None) -> Labelled
         raise InputError(
             f"goes from {nm[0]:g} to {nm[-1]:g} nm, there is a band at {beyond[0]:.4g} nm",
             path,
-            WANTED,
+            "give spectra that reach over all bands, their wavelengths in nm",
         )
     return found
 
 
 def _table(path: Path) -> LabelledSpectra:
-    head, *rows = [
-        row for row in csv.reader(read_text(path, "class", WANTED).splitlines()) if any(row)
-    ] or [[]]
+    lines = read_text(path, "class", WANTED).splitlines()
+    # programs for tables write semicolons where the comma is a decimal point
+    comma = next((c for c in ",;\t" if lines and c in lines[0]), ",")
+    head, *rows = [row for row in csv.reader(lines, delimiter=comma) if any(row)] or [[]]
     labels = tuple(name.strip() for name in head[1:])
     if not labels:
         raise InputError("names 0 classes in its first line", path, WANTED)
@@ -67,9 +72,23 @@ def _table(path: Path) -> LabelledSpectra:
     if numbers.ndim != 2 or numbers.shape[1] != len(head) or len(numbers) < 2:
         raise InputError("has lines of different length, or fewer than three", path, WANTED)
     numbers = numbers[np.argsort(numbers[:, 0])]
-    if not (np.abs(numbers) <= LARGEST).all() or (np.diff(numbers[:, 0]) <= 0).any():
-        raise InputError("has a wavelength twice, or values that are not finite", path, WANTED)
-    return LabelledSpectra(labels, numbers[:, 0] * 1e-9, numbers[:, 1:].T)
+    nm, values = numbers[:, 0], numbers[:, 1:]
+    if not np.isfinite(nm).all() or (np.diff(nm) <= 0).any():
+        raise InputError("has a wavelength twice, or one that is no number", path, WANTED)
+    for wrong, trouble, mend in (
+        (~np.isfinite(values), "not finite", "leave the spectrum or the wavelength out"),
+        (values > BRIGHTEST, "no reflectance", "write 0.25 for 25 %"),
+        (values < -BRIGHTEST / 100, "below 0", "give reflectances of 0 to 1"),
+    ):
+        if wrong.any():
+            row, column = np.argwhere(wrong)[0]
+            raise InputError(
+                f"has {values[row, column]:g} at {nm[row]:g} nm in column {column + 2} "
+                f"({labels[column]}), which is {trouble}",
+                path,
+                mend,
+            )
+    return LabelledSpectra(labels, nm * 1e-9, values.T)
 
 
 def _image(path: Path, label: str) -> LabelledSpectra:

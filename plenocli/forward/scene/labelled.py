@@ -39,9 +39,12 @@ class SpectraChart:
     def __init__(self, shown: LabelledSpectra) -> None:
         """shown: of many spectra, MOST_PATCHES, as many of one class as of another."""
         names = list(dict.fromkeys(shown.labels))
-        most = -(-MOST_PATCHES // len(names))
+        most = max(1, MOST_PATCHES // len(names))
         of = {n: [i for i, label in enumerate(shown.labels) if label == n] for n in names}
-        some = {n: all_[:: -(-len(all_) // most)] for n, all_ in of.items()}
+        some = {
+            n: [all_[i * len(all_) // most] for i in range(most)] if len(all_) > most else all_
+            for n, all_ in of.items()
+        }
         chosen = sorted(i for places in some.values() for i in places)
         self.spectra = LabelledSpectra(
             tuple(shown.labels[i] for i in chosen), shown.wavelengths, shown.spectra[chosen]

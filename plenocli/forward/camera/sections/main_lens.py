@@ -169,8 +169,8 @@ class MainLens(Section):
             raise ValueError("heights of field must ascend from 0 without repetition")
         if self.field and not self.field[0].is_symmetric:
             raise ValueError(
-                "the first row of field is the axis, where a lens is the same in all directions: no "
-                "transmission below 1, and only Noll terms without azimuth (4, 11, 22 ...)"
+                "the first row of field is the axis, where a lens is the same in all directions: "
+                "no transmission below 1, and only Noll terms without azimuth (4, 11, 22 ...)"
             )
         if self.aperture_shape == "image" and any(row.transmission < 1 for row in self.field):
             raise ValueError(

@@ -3,6 +3,7 @@ import json
 import numpy as np
 import pytest
 
+from plenocli.base import progress
 from plenocli.base.errors import InputError, UsageError
 from plenocli.cli.main import run
 from plenocli.files.artefacts.container import Artefact
@@ -95,7 +96,7 @@ def test_only_the_metrics_asked_for(picture):
     assert not (folder / "t.json").exists()
 
 
-def test_one_bad_result_does_not_stop_the_others(picture, capfd):
+def test_one_bad_result_does_not_stop_the_others(picture, capfd, monkeypatch):
     folder, capture, good, *_ = picture
     (folder / "torn.h5").write_bytes((folder / "poor.h5").read_bytes()[:-100])
     with pytest.raises(InputError, match="1 of 2 results failed: torn.h5; the others are scored"):
@@ -104,6 +105,7 @@ def test_one_bad_result_does_not_stop_the_others(picture, capfd):
     assert "error" in document["results"][0] and str(folder) not in document["results"][0]["error"]
     assert document["metrics"]["psnr_db"] == pytest.approx(40, abs=1e-4)
     capfd.readouterr()
+    monkeypatch.setattr(progress, "quiet", True)  # which errors do not heed
     with pytest.raises(
         InputError, match="2 of 2 results failed: torn.h5, none.h5; nothing is written"
     ):

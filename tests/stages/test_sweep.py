@@ -664,6 +664,29 @@ def test_a_camera_is_expected_to_tell_classes_without_a_capture(tmp_path):
     assert taught <= ideal[0] == ideal[1] and both <= ideal[2] == ideal[3]
 
 
+@pytest.mark.parametrize(
+    "table, detect, message",
+    [
+        ("nm,a,b\n400,25,30\n700,30,40\n", "a", "write 0.25 for 25 %"),
+        ("nm,a,b\n400,.25,.3\n700,.3,.4\n", "rust", "rust is no class of"),
+        (None, "a", "cannot be read"),
+    ],
+)
+def test_classes_that_no_point_could_be_scored_by_end_a_sweep_before_it_starts(
+    tmp_path, table, detect, message
+):
+    if table:
+        (tmp_path / "paints.csv").write_text(table)
+    (tmp_path / "sweep.toml").write_text(
+        f'camera = "{ROOT}/sample_configs/codesign.toml"\nchain = "expected"\n'
+        '[vary]\n"sensor.exposure" = ["0.5 ms", "5 ms"]\n'
+        f'[score]\nclasses = "paints.csv"\ndetect = "{detect}"\n'
+    )
+    with pytest.raises(PlenoError, match=message):
+        sweep(tmp_path / "sweep.toml", tmp_path / "s.h5")
+    assert not list(tmp_path.glob("s.*"))
+
+
 def test_values_are_written_as_given_and_read_as_numbers(whole):
     with open(whole[1].with_suffix(".csv"), newline="") as file:
         rows = list(csv.DictReader(file))

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from plenocli.base.errors import InputError
+from plenocli.base.errors import InputError, UsageError
 from plenocli.files.config.toml_file import read_text
 from plenocli.forward.scene.labelled import LabelledSpectra
 
@@ -55,6 +55,19 @@ def read_labelled(path: Path | str, bands: np.ndarray | None = None) -> Labelled
             "give spectra that reach over all bands, their wavelengths in nm",
         )
     return found
+
+
+def require_class(known: LabelledSpectra, name: str | None, path: Path | str) -> None:
+    """UsageError where a class is looked for (--detect) that there is none of.
+
+    known: the labelled spectra of `path`.
+    """
+    if name not in (None, *known.labels):
+        raise UsageError(
+            f"{name} is no class of {path}",
+            "--detect",
+            f"choose one of {', '.join(dict.fromkeys(known.labels))}",
+        )
 
 
 def _table(path: Path) -> LabelledSpectra:

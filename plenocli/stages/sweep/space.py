@@ -26,6 +26,7 @@ from plenocli.stages.sweep.task import (
 
 if TYPE_CHECKING:
     from plenocli.files.config.sweep_file import Choice, Range, Sweep
+    from plenocli.forward.scene.labelled import LabelledSpectra
     from plenocli.stages.sweep.task import Description
 
 ReadOptions = Callable[[str, Mapping[str, Any]], dict[str, Any]]
@@ -65,6 +66,7 @@ class Space:
     base: the camera it starts from, as its TOML says, from camera_path.
     read_options: (stage, values) -> option -> value, as the command line reads them.
     files: path -> SHA-256 of the files named so far.
+    spectra: path -> labelled spectra of those that hold such.
     """
 
     path: Path
@@ -76,6 +78,7 @@ class Space:
     read_options: ReadOptions
     seed: int
     files: dict[str, str] = field(default_factory=dict)
+    spectra: dict[str, LabelledSpectra] = field(default_factory=dict)
 
     def point(self, number: int, values: Mapping[str, Any]) -> DesignPoint:
         """The point of these values; refused already where no such camera can be."""
@@ -86,6 +89,7 @@ class Space:
             for stage, given in options_of(self.sweep, values).items()
         }
         self._remember(options)
+        self._check_spectra(options)
         try:
             camera = self._camera(
                 changed(self.base, {**self.sweep.set, **values}, self.sweep.follow)
@@ -160,6 +164,19 @@ class Space:
                 for value in np.ravel(values.get(name) or []):
                     if Path(str(value)).exists():
                         self._digested(Path(str(value)))
+
+    def _check_spectra(self, options: Mapping[str, Mapping[str, Any]]) -> None:
+        """Read the labelled spectra that options name, which every point would end without."""
+        from plenocli.files.read.class_table import read_labelled, require_class
+
+        for stage, name in (("score", "classes"), ("score", "prior"), ("demux", "prior")):
+            table = options.get(stage, {}).get(name)
+            if table is None:
+                continue
+            if str(table) not in self.spectra:
+                self.spectra[str(table)] = read_labelled(table)
+            if name == "classes":
+                require_class(self.spectra[str(table)], options[stage].get("detect"), table)
 
 
 def open_space(path: Path | str, read_options: ReadOptions, seed: int = 0) -> Space:

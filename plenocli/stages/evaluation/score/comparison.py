@@ -15,12 +15,11 @@ from plenocli.evaluation.scores import ResultScore
 from plenocli.evaluation.spectra_score import (
     SpectraScore,
 )
-from plenocli.files.read.class_table import read_labelled
+from plenocli.files.read.class_table import read_labelled, require_class
 
 if TYPE_CHECKING:
     from plenocli.evaluation.metrics.classes import Classes
     from plenocli.forward.camera.model import Camera
-    from plenocli.forward.scene.labelled import LabelledSpectra
     from plenocli.report.score_page import Compared
 
 
@@ -81,23 +80,13 @@ def classes_of(comparison: Comparison, bands: np.ndarray) -> Classes | None:
             )
         return None
     known, camera = read_labelled(comparison.classes, bands), comparison.camera
-    require_class(comparison, known)
+    require_class(known, comparison.detect, comparison.classes)
     seen = (
         known.at(bands)
         if camera is None
         else through_filters(lambda w: known.at(w).T, camera, bands)[:, 0].T
     )
     return Classes.of_spectra(known.labels, seen)
-
-
-def require_class(comparison: Comparison, known: LabelledSpectra) -> None:
-    """UsageError where a class is looked for that there is none of."""
-    if comparison.detect not in (None, *known.labels):
-        raise UsageError(
-            f"{comparison.detect} is no class of {comparison.classes}",
-            "--detect",
-            f"choose one of {', '.join(dict.fromkeys(known.labels))}",
-        )
 
 
 def nanometres(wavelengths: np.ndarray) -> tuple[float, ...]:

@@ -11,7 +11,7 @@ from plenocli.evaluation.metrics.response import score_response
 from plenocli.evaluation.response_score import ComparedResponse, paired_responses
 from plenocli.evaluation.results import Result
 from plenocli.evaluation.scores import ResultScore
-from plenocli.files.read.class_table import read_labelled
+from plenocli.files.read.class_table import read_labelled, require_class
 from plenocli.files.results.results import (
     read_response,
 )
@@ -20,7 +20,6 @@ from plenocli.stages.evaluation.score.comparison import (
     Comparison,
     Scored,
     nanometres,
-    require_class,
 )
 
 if TYPE_CHECKING:
@@ -40,7 +39,8 @@ def score_calibration(response: ComparedResponse, comparison: Comparison) -> Sco
         pair = paired_responses(response, read_response(comparison.truth))
         bands, found = pair.wavelengths, figures(score_response(pair.first, pair.second))
     if comparison.classes is not None:
-        require_class(comparison, read_labelled(comparison.classes))
+        known = read_labelled(comparison.classes)
+        require_class(known, comparison.detect, comparison.classes)
         expected = run_expected(
             response.path,
             comparison.classes,

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from plenocli.base.errors import InputError, PlenoError
-from plenocli.base.progress import note
+from plenocli.base.progress import tell
 from plenocli.base.tiling import Plane
 from plenocli.evaluation.chosen import definitions_of, keep_chosen
 from plenocli.evaluation.metrics.figures import figures
@@ -235,7 +235,7 @@ def _attempt(path: Path | str, comparison: Comparison, alone: bool) -> Scored:
 
 def _failed(path: Path | str, error: PlenoError) -> Scored:
     """The place of a result that cannot be scored; its error is told."""
-    note(f"error: {error}")
+    tell(f"plenocli: error: {error}", error=True)
     name = Path(path).name
     return Scored(
         score=ResultScore(name=name, error=str(error).replace(str(path), name)), failed=error

@@ -158,7 +158,11 @@ def pupil_change(camera: Camera, wavelength: float, chief: tuple[float, float]) 
 
     Returns a number, 1 at the most.
     """
-    here, there = (at_field(camera, wavelength, at).main_lens for at in (ON_AXIS, chief))
+    here = at_field(camera, wavelength).main_lens
+    try:
+        there = at_field(camera, wavelength, chief).main_lens
+    except NumericsError:  # no light, which is no reason to know nothing of the axis
+        return 1.0
     if here is there:
         return 0.0
     axis = np.linspace(-0.5, 0.5, 2 * CHANGE_NODES + 1)[1::2] * here.aperture_diameter
@@ -280,7 +284,7 @@ def _off_axis(
     start = aim(
         inside.lens, wavelength, points, angle=angle, object_distance=inside.object_distance
     )
-    rims = _rims(inside.lens, wavelength, start, points, place / radius)
+    rims = _rims(inside.lens, wavelength, start, points, place / radius, angle)
     terms = tuple((j, float(c)) for j, c in zip(cosine, found))
     return terms, tuple((centre * radius, size * radius) for centre, size in rims)
 
@@ -302,14 +306,20 @@ def _field_angle(inside: CameraLens, wavelength: float, slope: float) -> float:
 
 
 def _rims(
-    lens: Prescription, wavelength: float, start: Rays, points: np.ndarray, place: np.ndarray
+    lens: Prescription,
+    wavelength: float,
+    start: Rays,
+    points: np.ndarray,
+    place: np.ndarray,
+    angle: float,
 ) -> list[tuple[float, float]]:
     """Discs (centre along a, radius) over the pupil's radius that the stop and the clear apertures
     leave open, those that cut nothing left out; NumericsError where they leave nothing.
 
     start: rays of a field;
     points: (2, ray) x, y where they meet the stop, over its radius;
-    place: (2, ray) the same over the pupil's radius, along a and b.
+    place: (2, ray) the same over the pupil's radius, along a and b;
+    angle: of the field, rad.
     """
     squares = [(points**2).sum(axis=0)]
     for number, surface in enumerate(lens.surfaces):
@@ -318,7 +328,8 @@ def _rims(
             squares.append((at[0] ** 2 + at[1] ** 2) / surface.semi_diameter**2)
     if not (np.nan_to_num(squares, nan=2.0) <= 1).all(axis=0).any():
         raise NumericsError(
-            "the rims of the lens keep all light from a lenslet",
+            f"the rims of the lens keep all light from a lenslet {math.degrees(angle):.3g} degrees "
+            "off the axis",
             "main_lens.prescription",
             "use a smaller array, or mend the semi_diameters of the lens",
         )

@@ -384,18 +384,25 @@ def _chief(
     """Where the ray to the stop's centre crosses the entrance pupil's plane, (2, 1) m; wide
     fields are reached in steps.
     """
-    zero = np.zeros((2, 1))
-    for steps in (1, 4, 16):
-        at = zero
+    zero, reached = np.zeros((2, 1)), None
+    for steps in (1, 4, 16, 64):
+        # heights at the first vertex, which change less with the angle than those at the pupil
+        height, before = zero, zero
         for i in range(1, steps + 1):
-            source = _Source(
-                lens, wavelength, math.atan(math.tan(angle) * i / steps), object_distance
-            )
-            at, ok = _solve(lens, wavelength, source, at, zero)
+            source = _Source(lens, wavelength, angle * i / steps, object_distance)
+            climb = source.pupil.position * math.tan(angle * i / steps) * np.array([[0.0], [1.0]])
+            start = zero if i == 1 else 2 * height - before + climb
+            at, ok = _solve(lens, wavelength, source, start, zero)
             if not ok.all():
                 break
+            height, before = at - climb, height
         else:
-            return at
+            # far off the axis other rays reach the stop, by ways that end on a later surface
+            if trace(lens.surfaces, source.rays(at), wavelength).alive.all():
+                return at
+            reached = at
+    if reached is not None:
+        return reached
     raise NumericsError(
         f"no ray from {math.degrees(angle):.4g} degrees reaches the centre of the stop",
         "lens",

@@ -12,7 +12,7 @@ from scipy.optimize import brentq
 
 from plenocli.files.config.prescription_file import import_lens
 from plenocli.forward.camera.field import at_field
-from plenocli.forward.camera.lens import first_order
+from plenocli.forward.camera.lens import chief_height, first_order, paraxial_image
 from plenocli.forward.camera.pupil import aperture_picture
 from plenocli.forward.camera.pupil import wavefront as of_pupil
 from tests.forward.propagation.cameras import small_camera
@@ -193,6 +193,47 @@ def test_lenslets_see_what_optiland_s_rays_say(tmp_path, name, f_number, degrees
         for slope in (0.0, math.tan(math.radians(degrees))):
             for microns in (0.45, 0.55, 0.65):
                 _compare(theirs, camera, slope, microns, waves)
+
+
+@pytest.mark.parametrize(
+    "name, degrees, low, high",
+    [
+        ("WideAngle170FOV", 80, -3.9, -3.7),
+        ("WideAngle170FOV", 85, -6.22, -6.02),
+        ("ProjectionLens160FOV", 49, -3.6, -2.9),
+    ],
+)
+def test_chief_rays_of_very_wide_lenses_are_found(tmp_path, name, degrees, low, high):
+    """From heights (mm) at the first vertex between which the one ray lies that gets through the
+    stop's centre and the lens, at the wavelength of the F line.
+    """
+    pytest.importorskip("optiland", reason="needs the extra [lens]")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        from optiland.fileio import save_optiland_file
+        from optiland.rays import RealRays
+        from optiland.samples import objectives
+
+        optic = getattr(objectives, name)()
+        save_optiland_file(optic, str(tmp_path / "lens.json"))
+        lens, _ = import_lens(tmp_path / "lens.json")
+        surfaces, plane = list(optic.surfaces), 1e3 * paraxial_image(lens, 486.1e-9)
+        climb, ahead = math.sin(math.radians(degrees)), math.cos(math.radians(degrees))
+
+        def height(y, index):
+            rays = RealRays(0.0, y - 5 * climb, -5 * ahead, 0.0, climb, ahead, 1.0, 0.4861)
+            for surface in surfaces[1 : index + 1]:
+                surface.trace(rays)
+            return rays
+
+        stop = optic.surfaces.stop_index
+        y = brentq(lambda y: float(height(y, stop).y[0]), low, high, xtol=1e-13)
+        last = height(y, len(surfaces) - 2)
+        z = float(np.ravel(surfaces[-2].geometry.cs.z)[0]) + plane
+        found = float((last.y + (z - last.z) / last.N * last.M)[0])
+    angle = math.radians(degrees)
+    seen = chief_height(lens, 486.1e-9, angle, image_distance=plane / 1e3)
+    assert 1e3 * seen == pytest.approx(found, rel=1e-7)
 
 
 def _compare(theirs, camera, slope, microns, waves):

@@ -22,9 +22,7 @@ from plenocli.files.artefacts.chunks import FILTERS, write_chunks
 from plenocli.files.artefacts.container import HEADER_BYTES, MAGIC, READ_BYTES, Artefact, is_raw
 from plenocli.files.artefacts.kinds import SCHEMAS
 from plenocli.files.artefacts.sparse import SparseFile
-from plenocli.files.artefacts.structure import (
-    EMPTY_AXIS,
-)
+from plenocli.files.artefacts.structure import EMPTY_AXIS
 from plenocli.files.atomic import replacement, reserve, write_at
 
 _CHUNK_BYTES = 1 << 20

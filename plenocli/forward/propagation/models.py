@@ -25,9 +25,7 @@ from plenocli.forward.propagation.harmonics import sizing as harmonic_sizing
 from plenocli.forward.propagation.lenslet_fields import LensletFields
 from plenocli.forward.propagation.plan import BandPlan, PifPlan
 from plenocli.forward.propagation.ray import rays
-from plenocli.forward.propagation.sampling import (
-    size_band,
-)
+from plenocli.forward.propagation.sampling import size_band
 
 if TYPE_CHECKING:
     from plenocli.forward.camera.geometry import Geometry

@@ -3,9 +3,7 @@
 import math
 from typing import Literal, Self
 
-from pydantic import (
-    model_validator,
-)
+from pydantic import model_validator
 
 from plenocli.base.quantities import (
     Length,

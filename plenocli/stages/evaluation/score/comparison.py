@@ -12,9 +12,7 @@ import numpy as np
 from plenocli.base.errors import PlenoError, UsageError
 from plenocli.evaluation.results import WhiteTarget
 from plenocli.evaluation.scores import ResultScore
-from plenocli.evaluation.spectra_score import (
-    SpectraScore,
-)
+from plenocli.evaluation.spectra_score import SpectraScore
 from plenocli.files.read.class_table import read_labelled, require_class
 
 if TYPE_CHECKING:

@@ -12,9 +12,7 @@ from plenocli.evaluation.response_score import ComparedResponse, paired_response
 from plenocli.evaluation.results import Result
 from plenocli.evaluation.scores import ResultScore
 from plenocli.files.read.class_table import read_labelled, require_class
-from plenocli.files.results.results import (
-    read_response,
-)
+from plenocli.files.results.results import read_response
 from plenocli.stages.evaluation.expected import run_expected
 from plenocli.stages.evaluation.score.comparison import (
     Comparison,

@@ -19,9 +19,7 @@ from plenocli.evaluation.spectra_score import (
     SpectraScore,
     score_spectra,
 )
-from plenocli.files.results.results import (
-    read_block,
-)
+from plenocli.files.results.results import read_block
 from plenocli.files.results.truths import CHART, read_labels, read_true_s1, read_truth
 from plenocli.stages.evaluation.score.comparison import Comparison, Scored, classes_of, nanometres
 

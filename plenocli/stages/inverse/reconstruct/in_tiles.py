@@ -14,9 +14,7 @@ from plenocli.base.errors import PlenoError
 from plenocli.base.progress import bar, collected_notes, note
 from plenocli.execution.pool import Pool, run_all
 from plenocli.files.artefacts.provenance import file_digest
-from plenocli.files.read.captures import (
-    superpixel_source,
-)
+from plenocli.files.read.captures import superpixel_source
 from plenocli.inverse.picture.estimate import estimate
 from plenocli.inverse.picture.estimators import Estimators
 from plenocli.inverse.picture.footprint import cleaned, require_reconstruction

@@ -18,9 +18,7 @@ from plenocli.files.read.captures import (
     read_white,
     superpixel_source,
 )
-from plenocli.files.read.system_matrices import (
-    FieldMatrix,
-)
+from plenocli.files.read.system_matrices import FieldMatrix
 from plenocli.inverse.calibration.calibration import there
 from plenocli.inverse.picture.diagnosis import Seen
 from plenocli.inverse.picture.estimate import estimate

@@ -119,6 +119,22 @@ def test_points_that_are_too_coarse_are_told_from_a_camera_that_is_another(folde
     assert "finer than 4 x 4 points a lenslet" in capsys.readouterr().err
 
 
+def test_light_of_the_neighbours_is_told_from_a_camera_that_is_another(folder, capsys):
+    """By the fit, and by a picture of a matrix that knows none."""
+    capture, pif = folder / "with-neighbours.h5", folder / "alone.h5"
+    made = ["capture-sim", str(folder / "camera.toml"), "--accuracy", "2e-2", "--snr", "45dB"]
+    assert run([*made, "--scene", "skimage:astronaut", "-o", str(capture)]) == 0
+    assert run(["simulate-pif", str(folder / "camera.toml"), *ALONE, "-o", str(pif)]) == 0
+    capsys.readouterr()
+    asked = ["fit-camera", str(capture), "--camera", str(folder / "camera.toml")]
+    assert run([*asked, "-o", str(folder / "never.toml")]) == 5
+    said = "light of the neighbouring lenslets explains most"
+    assert said in capsys.readouterr().err
+    asked = ["reconstruct", str(capture), "--pif", str(pif), "--method", "lmmse"]
+    assert run([*asked, "-o", str(folder / "n.h5")]) == 0
+    assert said in capsys.readouterr().err
+
+
 def test_the_summary_as_json(folder, capsys):
     command = ["fit-camera", str(folder / "capture.h5"), "--camera", str(folder / "real.toml")]
     fixed = ["focus", "pitch", "wavelength", "lenslet focal length"]

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from plenocli.base.errors import NumericsError
 from plenocli.base.text import by
+from plenocli.forward.accuracy.dial import plan_pif
 from plenocli.forward.camera.geometry import geometry
+from plenocli.forward.propagation.system_matrix import build_pif
 from plenocli.inverse.fit.ascent import Ascent, Point
-from plenocli.inverse.fit.problem import CapturedLenslets, fit_problem
+from plenocli.inverse.fit.problem import CapturedLenslets, FitProblem, fit_problem
 
 if TYPE_CHECKING:
     from plenocli.forward.camera.model import Camera
@@ -30,6 +34,12 @@ HELPS = 0.9
 """Times the noise that was likely before: a cause must explain so much."""
 SHOWN = 0.5
 """Of what is left over beyond the noise, that finer points may leave at most to be the cause."""
+DIM = 0.1
+"""Of the noise, below which neighbours' light explains nothing."""
+FEW, SOME, ROUGH, GLANCE = 8, 0.6, 0.05, 3.0
+"""Points a side, and for each diffraction cell of a field, of neighbours' even light, its accuracy,
+and seconds (at nominal rates) that it may take.
+"""
 FINE, FINEST = 1.3, 40
 """Points a side for each diffraction cell of a field, from which on finer ones show nothing more
 (docs/model.md); and as many as are tried, at most.
@@ -44,7 +54,8 @@ def likeliest_cause(
     seed: int = 0,
 ) -> str | None:
     """What explains most of what the described camera does not, and what to do, a sentence: one of
-    its parameters alone, or detail of the objects that is finer than its points.
+    its parameters alone, detail of the objects that is finer than its points, or light of the
+    neighbouring lenslets.
 
     By the slopes of the evidence and its curvature at the description, and one step along the
     parameters that promise most; some are tried either way. A hint and no measurement: paraxial,
@@ -59,19 +70,20 @@ def likeliest_cause(
     if cells > FINEST and min(camera.object.samples_per_lenslet) < cells / 2:
         return coarse_points(camera)  # no camera with such points explains anything
     problem = fit_problem(camera, [capture], pictures, lenslets=LENSLETS, seed=seed)
-    family = problem.family
-    ascent = Ascent(family, problem.evidence, tolerance=problem.tolerance)
-    start = ascent.point(np.zeros(len(family.parameters)))
+    ascent, at_start = _ascent(problem), np.zeros(len(problem.family.parameters))
+    start = ascent.point(at_start)
     place, at = _best_step(ascent, start)
-    detail = detail_beyond_points(
+    other = beyond_parameters(
         camera, [capture], pictures, left=at.factor, described=start.factor, seed=seed
     )
-    if detail is not None or at.factor > HELPS * start.factor:
-        return detail
+    if other is not None:
+        return other
+    if at.factor > HELPS * start.factor:
+        return None
     return f"{_said(ascent, start, at, place)}; --fit finds the camera that fits"
 
 
-def detail_beyond_points(
+def beyond_parameters(
     camera: Camera,
     captures: Sequence[CapturedLenslets],
     pictures: Sequence[np.ndarray],
@@ -80,29 +92,77 @@ def detail_beyond_points(
     described: float,
     seed: int = 0,
 ) -> str | None:
-    """Whether objects have detail finer than the points of a camera, and what to do, a sentence;
-    None where finer points do not explain more than what else was found.
+    """What explains captures better than any of a camera's parameters, and what to do, a sentence:
+    detail of the objects that is finer than its points, or light of the neighbouring lenslets.
 
     camera, captures, pictures, seed: as in fit_camera.
-    left, described: times the noise, what the best camera with these points leaves over, and what
-        the described one does.
+    left, described: times the noise, what the best camera leaves over, and what the described one
+        does.
 
-    Raises as fit_camera does.
+    Returns None where neither does. Raises as fit_camera does.
     """
-    finer = _finely(camera)
-    if finer is None:
+
+    def left_over(camera: Camera, captures: Sequence[CapturedLenslets]) -> float:
+        problem = fit_problem(camera, captures, pictures, lenslets=LENSLETS, seed=seed)
+        return _ascent(problem).point(np.zeros(len(problem.family.parameters))).factor
+
+    found, finer = [], _finely(camera)
+    if finer is not None:
+        told = (
+            f"objects have detail finer than {by(camera.object.samples_per_lenslet)} points a "
+            "lenslet: by finer ones what is left over is {0:.2g} times the noise instead of {1:.2g}"
+            f" ({_advised(finer.object.samples_per_lenslet)})"
+        )
+        found.append((left_over(finer, captures), told))
+    alone = [own_light(camera, capture) for capture in captures]
+    if None not in alone:
+        told = (
+            "light of the neighbouring lenslets explains most (without it what is left over is "
+            "{0:.2g} times the noise instead of {1:.2g}): it takes a pif of --superpixels 3x3"
+        )
+        found.append((left_over(camera, [one for one in alone if one is not None]), told))
+    least, told = min(found, default=(math.inf, ""))
+    return None if least > min(left, _most(described)) else told.format(least, described)
+
+
+def _most(described: float) -> float:
+    """Times the noise that a cause may leave over where the described camera leaves so much."""
+    return min(HELPS * described, 1 + SHOWN * (described - 1))
+
+
+def _ascent(problem: FitProblem) -> Ascent:
+    return Ascent(problem.family, problem.evidence, tolerance=problem.tolerance)
+
+
+def own_light(camera: Camera, capture: CapturedLenslets) -> CapturedLenslets | None:
+    """A capture of a camera, in which lenslets see their neighbours' light, without it as far as
+    even objects behind each lenslet throw it; beyond the array the border goes on.
+
+    Returns None where that light is far below the noise, or takes long to know.
+    """
+    cells = geometry(camera, camera.light.wavelengths[0]).diffraction_cells
+    points = min(max(FEW, math.ceil(SOME * cells)), FINEST)
+    few = camera.replace(**{"object.samples_per_lenslet": (points, points)})
+    try:
+        plan = plan_pif(few, superpixels=(3, 3), accuracy=ROUGH)
+    except NumericsError:
         return None
-    problem = fit_problem(finer, captures, pictures, lenslets=LENSLETS, seed=seed)
-    ascent = Ascent(problem.family, problem.evidence, tolerance=problem.tolerance)
-    found = ascent.point(np.zeros(len(problem.family.parameters))).factor
-    most = min(left, HELPS * described, 1 + SHOWN * (described - 1))
-    if found > most:
+    if plan.chosen.seconds() > GLANCE:
         return None
-    return (
-        f"objects have detail finer than {by(camera.object.samples_per_lenslet)} points a lenslet: "
-        f"by finer ones what is left over is {found:.2g} times the noise instead of "
-        f"{described:.2g} ({_advised(finer.object.samples_per_lenslet)})"
-    )
+    built = build_pif(few, plan)
+    if built.A is None:
+        return None
+    even = built.A[0].mean(axis=2, dtype=float)
+    level = np.nan_to_num(capture.y.sum(axis=2)) / even.sum()
+    around = np.pad(level, 1, mode="edge")
+    rows, columns = level.shape
+    light = np.zeros(capture.y.shape)
+    for block, (r, c) in zip(even, built.lenslet_offset):
+        if r or c:
+            light += around[1 - r : 1 - r + rows, 1 - c : 1 - c + columns, None] * block
+    if np.sqrt(np.mean(light**2)) < DIM * capture.sigma:
+        return None
+    return replace(capture, y=capture.y - light)
 
 
 def coarse_points(camera: Camera) -> str | None:

@@ -87,7 +87,7 @@ def run_fit_camera(
     from plenocli.files.read.captures import read_white
     from plenocli.files.read.training import files_of
     from plenocli.inverse.fit.captures import believed_model, captured_lenslets
-    from plenocli.inverse.fit.causes import detail_beyond_points
+    from plenocli.inverse.fit.causes import beyond_parameters
     from plenocli.inverse.fit.optics import parameters_without
 
     inputs = [*captures, camera, calibration, *(files_of(training) or ())]
@@ -111,18 +111,19 @@ def run_fit_camera(
         seed=seed,
     )
     if not fit.accepted:
-        detail = detail_beyond_points(
+        # parameters that are far off explain some of anything
+        other = beyond_parameters(
             described,
             lenslets,
             pictures,
-            left=fit.noise_ratio,
+            left=fit.noise_ratio_before,
             described=fit.noise_ratio_before,
             seed=seed,
         )
         raise NumericsError(
             f"no camera near the described one explains the captures: the best {fit.why}",
             Path(camera).name,
-            detail
+            other
             or "check its distances, the calibration and --noise-sigma, or give more captures",
         )
     with together():

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from plenocli.forward.camera.geometry import geometry
-from plenocli.inverse.fit.causes import coarse_points, likeliest_cause
-from tests.forward.propagation.cameras import WAVELENGTH
+from plenocli.forward.propagation.system_matrix import build_pif
+from plenocli.inverse.fit.causes import coarse_points, likeliest_cause, own_light
+from plenocli.inverse.fit.problem import CapturedLenslets
+from tests.forward.propagation.cameras import WAVELENGTH, accuracy
 from tests.inverse.fit.test_fit import CAMERA, FAMILY, TRAINING, captured
 
 NAMES = [p.name for p in FAMILY.parameters]
@@ -63,3 +65,22 @@ def test_fewer_points_than_diffraction_cells_may_be_the_cause():
     wide = with_points(4).replace(**{"main_lens.aperture_diameter": 0.04})
     assert geometry(wide, WAVELENGTH).diffraction_cells > 40
     assert likeliest_cause(wide, captured(FAMILY.start), TRAINING) == coarse_points(wide)
+
+
+def test_neighbours_light_is_that_of_even_lenslets():
+    """Which is taken away to the accuracy it is asked in; an isolated capture at the same noise
+    keeps its parameters' names.
+    """
+    plan = accuracy.plan_pif(CAMERA, superpixels=(3, 3), accuracy=1e-3)
+    built = build_pif(CAMERA, plan)
+    level = 0.5 + 0.1 * np.arange(25.0).reshape(5, 5)
+    wide, seen = np.pad(level, 1, mode="edge"), np.zeros((5, 5, 256))
+    for block, (r, c) in zip(built.A[0].sum(axis=2), built.lenslet_offset):
+        seen += wide[1 - r : 6 - r, 1 - c : 6 - c, None] * block
+    own = built.A[0][[not any(o) for o in built.lenslet_offset]][0].sum(axis=1)
+    alone = own_light(CAMERA, CapturedLenslets(seen, 1e-3)).y
+    beside = seen - level[..., None] * own
+    assert np.abs(beside).max() > 0.02 * own.max()
+    left = alone - level[..., None] * own
+    assert np.linalg.norm(left[1:-1, 1:-1]) < 0.3 * np.linalg.norm(beside[1:-1, 1:-1])
+    assert own_light(CAMERA, CapturedLenslets(seen, 100.0)) is None

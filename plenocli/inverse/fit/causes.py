@@ -32,6 +32,8 @@ where light is off by more than its finest detail.
 """
 HELPS = 0.9
 """Times the noise that was likely before: a cause must explain so much."""
+ALL = 1.1
+"""Times the noise, all of what is left over but chance."""
 SHOWN = 0.5
 """Of what is left over beyond the noise, that finer points may leave at most to be the cause."""
 DIM = 0.1
@@ -72,11 +74,13 @@ def likeliest_cause(
     problem = fit_problem(camera, [capture], pictures, lenslets=LENSLETS, seed=seed)
     ascent, at_start = _ascent(problem), np.zeros(len(problem.family.parameters))
     start = ascent.point(at_start)
+    left, other = beyond_parameters(
+        camera, [capture], pictures, described=start.factor, seed=seed
+    ) or (math.inf, None)
+    if left <= ALL:  # and no parameter can say more
+        return other
     place, at = _best_step(ascent, start)
-    other = beyond_parameters(
-        camera, [capture], pictures, left=at.factor, described=start.factor, seed=seed
-    )
-    if other is not None:
+    if left <= at.factor:
         return other
     if at.factor > HELPS * start.factor:
         return None
@@ -88,18 +92,17 @@ def beyond_parameters(
     captures: Sequence[CapturedLenslets],
     pictures: Sequence[np.ndarray],
     *,
-    left: float,
     described: float,
     seed: int = 0,
-) -> str | None:
-    """What explains captures better than any of a camera's parameters, and what to do, a sentence:
-    detail of the objects that is finer than its points, or light of the neighbouring lenslets.
+) -> tuple[float, str] | None:
+    """What explains most of captures that is no parameter of a camera: detail of the objects that
+    is finer than its points, or light of the neighbouring lenslets.
 
     camera, captures, pictures, seed: as in fit_camera.
-    left, described: times the noise, what the best camera leaves over, and what the described one
-        does.
+    described: times the noise, what the described camera leaves over.
 
-    Returns None where neither does. Raises as fit_camera does.
+    Returns (times the noise that it leaves over, it and what to do, a sentence); None where neither
+        explains enough. Raises as fit_camera does.
     """
 
     def left_over(camera: Camera, captures: Sequence[CapturedLenslets]) -> float:
@@ -122,7 +125,7 @@ def beyond_parameters(
         )
         found.append((left_over(camera, [one for one in alone if one is not None]), told))
     least, told = min(found, default=(math.inf, ""))
-    return None if least > min(left, _most(described)) else told.format(least, described)
+    return None if least > _most(described) else (least, told.format(least, described))
 
 
 def _most(described: float) -> float:

@@ -111,20 +111,15 @@ def run_fit_camera(
         seed=seed,
     )
     if not fit.accepted:
-        # parameters that are far off explain some of anything
         other = beyond_parameters(
-            described,
-            lenslets,
-            pictures,
-            left=fit.noise_ratio_before,
-            described=fit.noise_ratio_before,
-            seed=seed,
+            described, lenslets, pictures, described=fit.noise_ratio_before, seed=seed
         )
         raise NumericsError(
             f"no camera near the described one explains the captures: the best {fit.why}",
             Path(camera).name,
-            other
-            or "check its distances, the calibration and --noise-sigma, or give more captures",
+            "check its distances, the calibration and --noise-sigma, or give more captures"
+            if other is None
+            else other[1],
         )
     with together():
         if details is not None:

@@ -68,12 +68,10 @@ def likeliest_cause(
     Returns None where nothing helps.
     Raises as fit_camera does.
     """
-    cells = geometry(camera, camera.light.wavelengths[0]).diffraction_cells
+    cells = _cells(camera)
     if cells > FINEST and min(camera.object.samples_per_lenslet) < cells / 2:
         return coarse_points(camera)  # no camera with such points explains anything
-    problem = fit_problem(camera, [capture], pictures, lenslets=LENSLETS, seed=seed)
-    ascent, at_start = _ascent(problem), np.zeros(len(problem.family.parameters))
-    start = ascent.point(at_start)
+    ascent, start = _start(fit_problem(camera, [capture], pictures, lenslets=LENSLETS, seed=seed))
     left, other = beyond_parameters(
         camera, [capture], pictures, described=start.factor, seed=seed
     ) or (math.inf, None)
@@ -107,7 +105,7 @@ def beyond_parameters(
 
     def left_over(camera: Camera, captures: Sequence[CapturedLenslets]) -> float:
         problem = fit_problem(camera, captures, pictures, lenslets=LENSLETS, seed=seed)
-        return _ascent(problem).point(np.zeros(len(problem.family.parameters))).factor
+        return _start(problem)[1].factor
 
     found, finer = [], _finely(camera)
     if finer is not None:
@@ -133,8 +131,15 @@ def _most(described: float) -> float:
     return min(HELPS * described, 1 + SHOWN * (described - 1))
 
 
-def _ascent(problem: FitProblem) -> Ascent:
-    return Ascent(problem.family, problem.evidence, tolerance=problem.tolerance)
+def _start(problem: FitProblem) -> tuple[Ascent, Point]:
+    """Where a fit begins: at the described camera."""
+    ascent = Ascent(problem.family, problem.evidence, tolerance=problem.tolerance)
+    return ascent, ascent.point(np.zeros(len(problem.family.parameters)))
+
+
+def _cells(camera: Camera) -> float:
+    """Diffraction cells of a lenslet's field, a side."""
+    return geometry(camera, camera.light.wavelengths[0]).diffraction_cells
 
 
 def own_light(camera: Camera, capture: CapturedLenslets) -> CapturedLenslets | None:
@@ -143,8 +148,7 @@ def own_light(camera: Camera, capture: CapturedLenslets) -> CapturedLenslets | N
 
     Returns None where that light is far below the noise, or takes long to know.
     """
-    cells = geometry(camera, camera.light.wavelengths[0]).diffraction_cells
-    points = min(max(FEW, math.ceil(SOME * cells)), FINEST)
+    points = min(max(FEW, math.ceil(SOME * _cells(camera))), FINEST)
     few = camera.replace(**{"object.samples_per_lenslet": (points, points)})
     try:
         plan = plan_pif(few, superpixels=(3, 3), accuracy=ROUGH)
@@ -172,7 +176,7 @@ def coarse_points(camera: Camera) -> str | None:
     """That points are fewer than a field's diffraction cells, and what to do, a sentence; None
     where they are not. Nothing is measured.
     """
-    cells = geometry(camera, camera.light.wavelengths[0]).diffraction_cells
+    cells = _cells(camera)
     known = camera.object.samples_per_lenslet
     if min(known) >= cells:
         return None
@@ -189,9 +193,8 @@ def _advised(points: tuple[int, int]) -> str:
 
 def _fine_points(camera: Camera) -> tuple[int, int]:
     """Points (rows, columns) so fine that finer ones show nothing more."""
-    cells = geometry(camera, camera.light.wavelengths[0]).diffraction_cells
     rows, columns = camera.object.samples_per_lenslet
-    least = math.ceil(FINE * cells)
+    least = math.ceil(FINE * _cells(camera))
     return max(rows, least), max(columns, least)
 
 

@@ -118,5 +118,6 @@ def brightest_crop(image: np.ndarray, most: int) -> np.ndarray:
 
 
 def in_frame(position: np.ndarray, shape: tuple[int, ...], margin: float) -> np.ndarray:
+    """(N,) bool, whether `margin` px around places (N, 2) px lie in a frame of so many pixels."""
     low = margin - 0.5 - FRAME_TOLERANCE
     return np.all((position >= low) & (position <= np.array(shape) - 1 - low), axis=-1)

@@ -159,6 +159,7 @@ def _condition(found: Diagnosis, dtype: str) -> str:
 
 
 def summary_of(output: str, matrix: SystemMatrix, found: Diagnosis, plan: PifPlan) -> PifSummary:
+    """What is told of a matrix that was written to `output`."""
     bands, _, pixels, points = plan.shape
     return PifSummary(
         output=output,

@@ -88,4 +88,5 @@ def classes_of(comparison: Comparison, bands: np.ndarray) -> Classes | None:
 
 
 def nanometres(wavelengths: np.ndarray) -> tuple[float, ...]:
+    """Wavelengths (band,) m, as scores tell them, nm."""
     return tuple(round(float(w) * 1e9, 6) for w in wavelengths)

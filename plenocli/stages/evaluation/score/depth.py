@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from plenocli.base.errors import InputError, UsageError
 from plenocli.evaluation.depth_score import known_depth, score_layered, score_lightfield
@@ -14,11 +13,12 @@ from plenocli.files.results.volumes import StoredVolume, read_volume, score_stor
 from plenocli.inverse.lightfield.planes import LightField
 from plenocli.stages.evaluation.score.comparison import Comparison, Scored
 
-if TYPE_CHECKING:
-    pass
-
 
 def score_planes(path: Path | str, field: LightField, comparison: Comparison) -> Scored:
+    """The depth that a refocused capture shows against the known one, or against opaque layers.
+
+    Raises InputError where either says no depth.
+    """
     try:
         known_depth(field)  # before the truth is looked at
         layers = _layers(comparison.truth)

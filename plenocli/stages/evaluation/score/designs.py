@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from plenocli.base.errors import InputError, UsageError
 from plenocli.evaluation.metrics.coherence import CoherenceScore, dictionary_coherence
 from plenocli.evaluation.metrics.figures import figures
@@ -20,11 +18,12 @@ from plenocli.stages.evaluation.score.comparison import (
     nanometres,
 )
 
-if TYPE_CHECKING:
-    pass
-
 
 def score_calibration(response: ComparedResponse, comparison: Comparison) -> Scored:
+    """A response against that of another calibration, and by the classes that it tells apart.
+
+    Raises UsageError where there is neither, or no such class.
+    """
     if comparison.truth is None and comparison.classes is None:
         raise UsageError(
             "the truth is missing",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -22,9 +21,6 @@ from plenocli.evaluation.spectra_score import (
 from plenocli.files.results.results import read_block
 from plenocli.files.results.truths import CHART, read_labels, read_true_s1, read_truth
 from plenocli.stages.evaluation.score.comparison import Comparison, Scored, classes_of, nanometres
-
-if TYPE_CHECKING:
-    pass
 
 
 def _polarised(result: Result, truth: Path | str) -> PolarisationScore | None:

@@ -7,7 +7,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -37,9 +36,6 @@ from plenocli.stages.evaluation.score.comparison import Comparison, Scored
 from plenocli.stages.evaluation.score.depth import score_planes, score_volume
 from plenocli.stages.evaluation.score.designs import score_calibration, score_dictionary
 from plenocli.stages.evaluation.score.pictures import score_image
-
-if TYPE_CHECKING:
-    pass
 
 
 def run_score(

@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from plenocli.base.errors import UsageError
 from plenocli.execution.batch import BatchSummary, outcomes, plan_batch, summarise
@@ -30,9 +30,6 @@ from plenocli.stages.inverse.reconstruct.recipe import (
 )
 from plenocli.stages.inverse.reconstruct.solved import PictureSummary, ReconstructSummary, Solved
 from plenocli.stages.inverse.reconstruct.write import write_picture
-
-if TYPE_CHECKING:
-    pass
 
 
 def run_reconstruct(

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from plenocli.base.errors import NumericsError
+from plenocli.base.linear_maps import BlockToeplitz
 from plenocli.base.text import by
 from plenocli.forward.accuracy.dial import plan_pif
 from plenocli.forward.camera.geometry import geometry
@@ -115,7 +116,7 @@ def beyond_parameters(
             f" ({_advised(finer.object.samples_per_lenslet)})"
         )
         found.append((left_over(finer, captures), told))
-    alone = [own_light(camera, capture) for capture in captures]
+    alone = [without_neighbours(camera, capture) for capture in captures]
     if None not in alone:
         told = (
             "light of the neighbouring lenslets explains most (without it what is left over is "
@@ -142,7 +143,7 @@ def _cells(camera: Camera) -> float:
     return geometry(camera, camera.light.wavelengths[0]).diffraction_cells
 
 
-def own_light(camera: Camera, capture: CapturedLenslets) -> CapturedLenslets | None:
+def without_neighbours(camera: Camera, capture: CapturedLenslets) -> CapturedLenslets | None:
     """A capture of a camera, in which lenslets see their neighbours' light, without it as far as
     even objects behind each lenslet throw it; beyond the array the border goes on.
 
@@ -159,14 +160,11 @@ def own_light(camera: Camera, capture: CapturedLenslets) -> CapturedLenslets | N
     built = build_pif(few, plan)
     if built.A is None:
         return None
-    even = built.A[0].mean(axis=2, dtype=float)
-    level = np.nan_to_num(capture.y.sum(axis=2)) / even.sum()
-    around = np.pad(level, 1, mode="edge")
-    rows, columns = level.shape
-    light = np.zeros(capture.y.shape)
-    for block, (r, c) in zip(even, built.lenslet_offset):
-        if r or c:
-            light += around[1 - r : 1 - r + rows, 1 - c : 1 - c + columns, None] * block
+    even = built.A[0].mean(axis=2, keepdims=True, dtype=float)
+    level = np.nan_to_num(capture.y.sum(axis=2, keepdims=True)) / even.sum()
+    around = np.pad(level, ((1, 1), (1, 1), (0, 0)), mode="edge")
+    array = BlockToeplitz(even, built.lenslet_offset, around.shape[:2])
+    light = array.neighbours_only().forward(around)[1:-1, 1:-1]
     if np.sqrt(np.mean(light**2)) < DIM * capture.sigma:
         return None
     return replace(capture, y=capture.y - light)

@@ -7,7 +7,7 @@ import pytest
 
 from plenocli.forward.camera.geometry import geometry
 from plenocli.forward.propagation.system_matrix import build_pif
-from plenocli.inverse.fit.causes import coarse_points, likeliest_cause, own_light
+from plenocli.inverse.fit.causes import coarse_points, likeliest_cause, without_neighbours
 from plenocli.inverse.fit.problem import CapturedLenslets
 from tests.forward.propagation.cameras import WAVELENGTH, accuracy
 from tests.inverse.fit.test_fit import CAMERA, FAMILY, TRAINING, captured
@@ -78,9 +78,9 @@ def test_neighbours_light_is_that_of_even_lenslets():
     for block, (r, c) in zip(built.A[0].sum(axis=2), built.lenslet_offset):
         seen += wide[1 - r : 6 - r, 1 - c : 6 - c, None] * block
     own = built.A[0][[not any(o) for o in built.lenslet_offset]][0].sum(axis=1)
-    alone = own_light(CAMERA, CapturedLenslets(seen, 1e-3)).y
+    alone = without_neighbours(CAMERA, CapturedLenslets(seen, 1e-3)).y
     beside = seen - level[..., None] * own
     assert np.abs(beside).max() > 0.02 * own.max()
     left = alone - level[..., None] * own
     assert np.linalg.norm(left[1:-1, 1:-1]) < 0.3 * np.linalg.norm(beside[1:-1, 1:-1])
-    assert own_light(CAMERA, CapturedLenslets(seen, 100.0)) is None
+    assert without_neighbours(CAMERA, CapturedLenslets(seen, 100.0)) is None

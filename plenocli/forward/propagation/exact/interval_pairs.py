@@ -43,8 +43,10 @@ class SensorSide:
     root: the roots of their weights;
     points: m on the array, that are computed;
     emphasis: their weights in what is left out;
-    modes: (lines, nodes), what the field on the nodes, weighted, is carried by, or None: the nodes
-        themselves.
+    modes: (lines, nodes), what the field on the nodes, weighted, is carried by once the path from
+        the lenslet's middle is taken out of it; None: the nodes, which are those of the pixels;
+    pixels: nodes of the pixels, m, where there are modes;
+    shown: (pixels' nodes, lines), the modes there.
     """
 
     u: np.ndarray
@@ -52,6 +54,8 @@ class SensorSide:
     points: np.ndarray
     emphasis: np.ndarray
     modes: np.ndarray | None = None
+    pixels: np.ndarray | None = None
+    shown: np.ndarray | None = None
 
     @property
     def lines(self) -> int:
@@ -128,16 +132,44 @@ class Interval:
         return g.k * (np.abs(d / np.hypot(d, goes) + bend - come).max() + g.D1 / (2 * g.z2))
 
     def wave(self, other: float) -> np.ndarray:
-        """W (u, x) towards superpixels displaced by `other` (m) along the other axis."""
+        """W (u, x) towards superpixels displaced by `other` (m) along the other axis, less its
+        `carrier` where the sensor's side has modes.
+        """
         g, u = self.geometry, self.side.u
+        taken_out = self._own_path(u) if self.side.modes is None else self._from_middle(u, other)
         phase = (
             path(self.offset + u[:, None] - self.x, g.z3, self.offset, other)
-            - path(self.aside + u, g.z3, self.aside, self.across)[:, None]
+            - taken_out[:, None]
             + self._incoming()
         )
         phase = phase - (self.x**2 / (2 * g.f2) if self.parabolic else path(self.x, g.f2))
         size = self.w * self._nearer() / math.sqrt(g.wavelength * g.z3)
         return (self.side.root[:, None] * size) * np.exp(1j * g.k * phase)
+
+    def _own_path(self, u: np.ndarray) -> np.ndarray:
+        """Path (m) to u from the middle of the superpixel's own lenslet, which no energy shows."""
+        return path(self.aside + u, self.geometry.z3, self.aside, self.across)
+
+    def _from_middle(self, u: np.ndarray, other: float) -> np.ndarray:
+        """Path (m) to u from the middle of this lenslet; other: as `wave`."""
+        return path(self.offset + u, self.geometry.z3, self.offset, other)
+
+    def on_pixels(self, factor: np.ndarray, other: float) -> np.ndarray:
+        """What modes of the sensor's side carry, as (pixels' nodes x points, terms).
+
+        factor: (lines x points, terms);
+        other: as `wave`.
+        """
+        side = self.side
+        if side.shown is None or side.pixels is None:
+            return factor
+        real, shape = factor.real.dtype, (side.lines, -1)
+        wide = side.shown.astype(real) @ factor.reshape(shape).view(real)
+        wide = wide.view(factor.dtype)
+        apart = self._from_middle(side.pixels, other) - self._own_path(side.pixels)
+        if apart.any():
+            wide *= np.exp(1j * self.geometry.k * apart).astype(factor.dtype)[:, None]
+        return wide.reshape(-1, factor.shape[1])
 
     def _incoming(self) -> np.ndarray:
         """Path (m) of the main lens's wave along this axis on the lenslet's nodes: off the axis of
@@ -266,6 +298,11 @@ class Pair:
         (some,) = _strong(brings[0] * _weighed(coupling, brings[1]), tolerance / 2)
         x, coupling = x[:, some], coupling[some][:, some]
         return x, x if self.symmetric else y[:, some], coupling
+
+    def on_pixels(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Columns for the rows' and for the columns' sensor sides, on the nodes of the pixels."""
+        left = self.row.on_pixels(x, self.column.offset)
+        return left, left if y is x else self.column.on_pixels(y, self.row.offset)
 
     def _come(self) -> ObliqueWave | None:
         """What the main lens's wave does along both axes together; None on the axis."""

@@ -55,6 +55,11 @@ over itself (measured: 0.5 to 2.3), from so many diffraction cells on.
 SIDES = 0.35
 """By how much finer coarse fields with neighbours are computed."""
 
+SPILL = 0.25
+"""Share of the light outside a point's brightest lenslet that may lie on a superpixel beside it:
+what a lenslet's far edge diffracts there is up to 0.23 of it (two cameras, f/4.4 and f/8).
+"""
+
 LEAST = 1e-10
 """Finest cut: below it is the rounding of double precision."""
 
@@ -83,12 +88,9 @@ def exact_band(
     cut = max(LEAST, cut * base.faintest)
     missed = CUT_EFFECT * max(CUT * accuracy, cut / base.faintest)
     missed *= math.sqrt(min(1.0, geometry.diffraction_cells / MANY_CELLS))
-    count = prolate_count(_bandwidth(geometry, superpixels), cut / 100)
-    count = (
-        count
-        if base.window is None and count < 0.8 * base.pixel_nodes * min(geometry.pixel_shape)
-        else 0
-    )
+    count = prolate_count(_bandwidth(geometry), cut / 100)
+    if count >= 0.8 * base.pixel_nodes * min(geometry.pixel_shape):
+        count = 0
     require_sketch(field_terms(geometry, base.terms, cut, True))
     return ExactBand(
         **vars(base) | {"sampling": math.hypot(base.sampling, missed)},
@@ -102,17 +104,13 @@ def _extent(geometry: Geometry, pixels: int) -> float:
     return (pixels + (geometry.pixel_shift is not None)) * geometry.pixel_pitch / 2
 
 
-def _bandwidth(geometry: Geometry, superpixels: tuple[int, int]) -> float:
-    """Largest phase (rad over half a superpixel) of a lenslet's field on its own superpixel, that
-    of its middle's path taken out, among `grid` superpixels: steeper rays come from no point of the
-    lenslet. Up to 5 % are added for slopes that change on the way: without them, prolate functions
-    fall short of waves that reach the band's end.
+def _bandwidth(geometry: Geometry) -> float:
+    """Largest phase (rad over half a superpixel) of a lenslet's field on any superpixel, the path
+    from its middle taken out: steeper rays come from no point of the lenslet. Up to 5 % are added
+    for slopes that change on the way: without them, prolate functions fall short of waves that
+    reach the band's end.
     """
-    reach, aside = (
-        _extent(geometry, max(geometry.pixel_shape)),
-        (max(superpixels) - 1) / 2 * (geometry.superpixel_pitch - geometry.D2),
-    )
-    source = geometry.lenslet_width / 2 + aside
+    reach, source = _extent(geometry, max(geometry.pixel_shape)), geometry.lenslet_width / 2
     bent = 1.5 * ((source + reach) / (2 * geometry.z3)) ** 2
     return geometry.k * source * reach / geometry.z3 * (1 + min(0.05, bent))
 
@@ -149,13 +147,13 @@ class ExactSquareLenslets(LensletFields):
         self.symmetry = flip_rows, flip_columns, turn
         alike = g.pixel_shape[0] == g.pixel_shape[1] and g.object_shape[0] == g.object_shape[1]
         self._turn = alike and turn
-        self._entering = self._light()
+        self._entering, self._counted = self._light()
         self._extent, self._bandwidth = (
             [_extent(geometry, n) for n in geometry.pixel_shape],
-            _bandwidth(geometry, plan.superpixels),
+            _bandwidth(geometry),
         )
-        self._sensor_sides: dict[tuple[int, int], SensorSide] = {}
-        self._intervals: dict[tuple[int, int, int], Interval] = {}
+        self._sensor_sides: dict[tuple[int, int, bool], SensorSide] = {}
+        self._intervals: dict[tuple[int, int, int, bool], Interval] = {}
         self._tables: dict[tuple[int, int], Factors] = {}
         counts = []
         for sy, sx in self._pairs():
@@ -200,50 +198,63 @@ class ExactSquareLenslets(LensletFields):
         points = self.geometry.points(axis)
         return points[: (len(points) + 1) // 2] if s == 0 and self.symmetry[axis] else points
 
-    def _sensor_side(self, s: int, axis: int) -> SensorSide:
-        """The SensorSide of superpixel s."""
-        if (s, axis) not in self._sensor_sides:
+    def _counts(self, s: int, axis: int, beside: bool) -> np.ndarray:
+        """How much errors of points' fields on superpixel s count, along one axis: (point,).
+
+        beside: whether the superpixel is not the lenslet's own along the other axis either.
+        """
+        # errors of dim light count by their own energy in the end: accuracy for both axes together
+        least = self.band.cut ** (0.25 if beside else 0.5)
+        weights = self._counted[axis][s + self._reach(axis)]
+        return np.maximum(weights[: len(self._points(s, axis))], least)
+
+    def _sensor_side(self, s: int, axis: int, beside: bool) -> SensorSide:
+        """The SensorSide of superpixel s; beside: as _counts."""
+        if (s, axis, beside) not in self._sensor_sides:
             g = self.geometry
-            modes, count, phase = None, self.band.sensor_count, self._bandwidth
+            count, phase, extent = self.band.sensor_count, self._bandwidth, self._extent[axis]
+            u, w = (
+                a.ravel()
+                for a in sensor_nodes(g, axis, self.band.pixel_nodes, s, self.band.pixel_rule)
+            )
+            modes = pixels = shown = None
             if count:
+                pixels, shown = u, np.sqrt(w / extent)[:, None] * prolate(u / extent, phase, count)
                 # functions beyond the bandwidth's own swing faster than it
                 t, w = gauss(nodes_for(2 * phase) + count - int(2 * phase / math.pi))
                 modes = prolate(t, phase, count).T * np.sqrt(w)
-                u, w = self._extent[axis] * t, self._extent[axis] * w
-            else:
-                u, w = (
-                    a.ravel()
-                    for a in sensor_nodes(g, axis, self.band.pixel_nodes, s, self.band.pixel_rule)
-                )
+                u, w = extent * t, extent * w
             points = self._points(s, axis)
-            self._sensor_sides[s, axis] = SensorSide(
+            self._sensor_sides[s, axis, beside] = SensorSide(
                 u=u,
                 root=np.sqrt(w),
                 points=points,
-                emphasis=edge_emphasis(g, points),
+                emphasis=edge_emphasis(g, points) * self._counts(s, axis, beside),
                 modes=modes,
+                pixels=pixels,
+                shown=shown,
             )
-        return self._sensor_sides[s, axis]
+        return self._sensor_sides[s, axis, beside]
 
-    def _interval(self, s: int, m: int, axis: int) -> Interval:
-        axis = 0 if self._turn else axis
-        if (s, m, axis) not in self._intervals:
-            self._intervals[s, m, axis] = Interval(
+    def _interval(self, s: int, m: int, axis: int, beside: bool) -> Interval:
+        axis, beside = 0 if self._turn else axis, beside and s != 0
+        if (s, m, axis, beside) not in self._intervals:
+            self._intervals[s, m, axis, beside] = Interval(
                 self.geometry,
                 self._field,
                 axis,
                 s,
                 m,
-                self._sensor_side(s, axis),
+                self._sensor_side(s, axis, beside),
                 self._parabolic,
                 self.band.cut / 3,
                 self.dtype,
             )
-        return self._intervals[s, m, axis]
+        return self._intervals[s, m, axis, beside]
 
-    def _light(self) -> np.ndarray:
-        """Share of the light of a point (row, column) that enters the lenslets of
-        the neighbourhood.
+    def _light(self) -> tuple[np.ndarray, list[np.ndarray]]:
+        """Share of the light of a point (row, column) that enters the lenslets of the
+        neighbourhood; by axis, how much errors of points count on superpixels (superpixel, point).
         """
         rows, signs = self._gram(0), self._field.signs
         alike = self._turn and self.superpixels[0] == self.superpixels[1]
@@ -251,29 +262,56 @@ class ExactSquareLenslets(LensletFields):
             columns = rows * np.outer(signs, signs)
         else:
             columns = self._gram(1)
-        return (rows.reshape(len(rows), -1) @ columns.reshape(len(columns), -1).T).real
+        y, x = rows.sum(axis=0), columns.sum(axis=0)
+        entering = (y.reshape(len(y), -1) @ x.reshape(len(x), -1).T).real
+        counted = [self._counting(rows, x, 0), self._counting(columns, y, 1)]
+        return entering, counted
+
+    def _counting(self, gram: np.ndarray, partner: np.ndarray, axis: int) -> np.ndarray:
+        """How much errors of points' fields count along an axis: (superpixel, point), at most 1. An
+        error dU of the field U adds 2 U dU to the light, and is a share of the root of the sum of
+        its squares, which the brightest superpixels make.
+
+        gram: (lenslet, point, term, term) of this axis;
+        partner: (point, term, term) of the other.
+        """
+        light = np.einsum("mpij,ij->mp", gram, partner.mean(axis=0)).real
+        far = (len(light) - self.superpixels[axis]) // 2
+        light = np.maximum(light[far : len(light) - far], np.finfo(float).tiny)
+        share = light / light.sum(axis=0)
+        most = share.max(axis=0)
+        shown = np.where(share == most, share, share + SPILL * np.maximum(1 - most - share, 0))
+        return np.minimum(1.0, np.sqrt(shown / (share**2).sum(axis=0)))
 
     def _gram(self, axis: int) -> np.ndarray:
-        """(point, term, term): overlaps of the terms of h over the lenslets."""
+        """(lenslet, point, term, term): overlaps of the terms of h over each lenslet."""
         g, points = self.geometry, self._points(0, axis)
-        total: np.ndarray | int = 0
         half = g.lenslet_width / 2
         t, w = gauss(psf_nodes(g, half))
+        grams = []
         for m in lit_lenslets(self._reach(axis), self.band.window):
             values = self._field.evaluate(half * t + m * g.D2 - points[:, None], axis)
             values = at_points(self._field, values, points[:, None]).transpose(0, 2, 1)
-            total = total + (values * (half * w)) @ values.conj().transpose(0, 2, 1)
-        gram = np.asarray(total)
-        return np.concatenate([gram, gram[: len(g.points(axis)) - len(points)][::-1]])
+            grams.append((values * (half * w)) @ values.conj().transpose(0, 2, 1))
+        gram = np.array(grams)
+        mirrored = gram[::-1, : len(g.points(axis)) - len(points)][:, ::-1]
+        return np.concatenate([gram, mirrored], axis=1)
 
     # products of two axes
 
     def _compressed(self, sy: int, sx: int) -> tuple[Factors, int]:
         """Factors of superpixel (sy, sx), and the pairs of terms that they are compressed from."""
-        cut, symmetric = self.band.cut, self._turn and sy == sx
+        symmetric, beside = self._turn and sy == sx, bool(sy and sx)
+        weights = [self._counts(s, axis, beside) for s, axis in ((sy, 0), (sx, 1))]
+        # between what points may lose that count as their mean and what they may that count fully
+        cut = self.band.cut * math.sqrt(
+            math.prod(math.sqrt(np.mean(weight**2)) for weight in weights)
+        )
         pairs = {
             (m, n): Pair(
-                self._interval(sy, m, 0), self._interval(sx, n, 1), symmetric and m == n == sy
+                self._interval(sy, m, 0, beside),
+                self._interval(sx, n, 1, beside),
+                symmetric and m == n == sy,
             )
             for m in self._lenslets(sy, 0)
             for n in self._lenslets(sx, 1)
@@ -289,6 +327,7 @@ class ExactSquareLenslets(LensletFields):
         right: list[np.ndarray] = []
         couplings: dict[tuple[int, int], Matrix] = {}
         count = len(self._points(sy, 0)) * len(self._points(sx, 1))
+        alone = len(kept) == 1
         for m, n in kept:
             pair, first = pairs[m, n], len(left)
             tolerance = cut / 2 if (m, n) == kept[-1] else cut / 2 / math.sqrt(len(kept))
@@ -297,6 +336,8 @@ class ExactSquareLenslets(LensletFields):
                 x, y, coupling = Product([x], [y], {(0, 0): coupling}, pair.symmetric).narrowed(
                     tolerance / 2 * math.sqrt(count)
                 ) or (x, y, coupling)
+            if not alone:  # lenslets interfere on the pixels
+                x, y = pair.on_pixels(x, y)
             # the lenslet mirrored by the diagonal brings the transpose
             if symmetric and not pair.symmetric:
                 left += [x, y]
@@ -308,10 +349,12 @@ class ExactSquareLenslets(LensletFields):
         right = left if symmetric else right
         product = Product(left, right, couplings, symmetric)
         high, wide = product.factors(cut * math.sqrt(count), guess)
+        if alone:
+            high, wide = pair.on_pixels(high, wide)
         products = max(c.shape[0] for c in couplings.values())
         return Factors(
-            self._to_pixels(high, sy, 0)[None],
-            self._to_pixels(wide, sx, 1)[None],
+            self._by_point(high, self._sensor_side(sy, 0, beside))[None],
+            self._by_point(wide, self._sensor_side(sx, 1, beside))[None],
             self.geometry.pixel_shape,
             self.band.pixel_nodes,
         ), products
@@ -319,21 +362,14 @@ class ExactSquareLenslets(LensletFields):
     def _expected_rank(self, sy: int, sx: int) -> float:
         return field_rank(self.geometry, self.band, self._parabolic, (sy != 0) + (sx != 0))
 
-    def _to_pixels(self, factor: np.ndarray, s: int, axis: int) -> np.ndarray:
-        """(lines of the sensor x points, terms) to (points, pixel nodes, terms)."""
-        g, side = self.geometry, self._sensor_side(s, axis)
-        real = factor.real.dtype
-        factor = (
-            factor.reshape(side.lines, len(side.points), -1) / side.emphasis.astype(real)[:, None]
-        )
-        factor = factor.view(real).transpose(1, 0, 2)
-        if side.modes is not None:
-            v, w = sensor_nodes(g, axis, self.band.pixel_nodes, s, self.band.pixel_rule)
-            matrix = np.sqrt(w.ravel() / self._extent[axis])[:, None] * prolate(
-                v.ravel() / self._extent[axis], self._bandwidth, side.lines
-            )
-            factor = matrix.astype(real) @ factor
-        return np.ascontiguousarray(factor).view(self.dtype)
+    def _by_point(self, factor: np.ndarray, side: SensorSide) -> np.ndarray:
+        """(pixels' nodes x points, terms) to (points, pixels' nodes, terms), all points as they
+        are.
+        """
+        real, points = factor.real.dtype, len(side.points)
+        factor = factor.reshape(-1, points, factor.shape[1])
+        factor = factor / side.emphasis.astype(real)[:, None]
+        return np.ascontiguousarray(factor.transpose(1, 0, 2)).astype(self.dtype, copy=False)
 
     # what the builder asks for
 

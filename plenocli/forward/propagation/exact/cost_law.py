@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from plenocli.base.budget import budget
 from plenocli.forward.propagation.costs import Features, summed
 from plenocli.forward.propagation.exact.oblique import field_work, orders_for
 from plenocli.forward.propagation.exact.term_counts import (
@@ -87,6 +88,13 @@ class _Sizes:
     kinds: list[_Kind]
 
     @property
+    def joined(self) -> float:
+        """By how much longer the factors of all lenslets together are than each one's: they meet on
+        the pixels' nodes.
+        """
+        return 1.0 if self.lit == 1 else self.lines / self.nodes
+
+    @property
     def tables(self) -> int:
         """Superpixels whose tables are computed."""
         return sum(kind.count for kind in self.kinds)
@@ -153,7 +161,7 @@ def features(
         summed(
             [seconds, field, *(_table_seconds(kind, sizes, wide, lenslets) for kind in sizes.kinds)]
         ),
-        tuple(held | _table_bytes(kind, sizes, geometry, item) for kind in sizes.kinds),
+        tuple(held | _together(kind, sizes, geometry, item) for kind in sizes.kinds),
     )
 
 
@@ -244,11 +252,12 @@ def _sizes(
 def _table_operations(kind: _Kind, sizes: _Sizes, band: ExactBand) -> dict[str, float]:
     rank, products = sizes.ranks[kind.aside], sizes.products[kind.aside]
     sketch, rows = sketch_size(rank), kind.count * kind.rows
+    joined = rows * sizes.joined
     # of many lenslets each brings few terms, so that products are narrow and wait for memory
     return {
-        "sketch_isolated" if sizes.lit == 1 else "sketch_joined": rows * products * sketch,
+        "sketch_isolated" if sizes.lit == 1 else "sketch_joined": joined * products * sketch,
         "intervals_applied": rows * products * sizes.across,
-        "basis": rows * sketch**2,
+        "basis": joined * sketch**2,
         "coupling": kind.count * sketch**3,
         "prolate": rows * sizes.lines * rank if band.sensor_count else 0.0,
     }
@@ -273,10 +282,18 @@ def _table_seconds(kind: _Kind, sizes: _Sizes, wide: float, lenslets: float) -> 
     }
 
 
+def _together(kind: _Kind, sizes: _Sizes, geometry: Geometry, item: int) -> dict[str, float]:
+    """What is held while as many threads as there are compress tables of at most this kind."""
+    at_once = min(budget().threads, sizes.tables)
+    one = _table_bytes(kind, sizes, geometry, item)
+    return {name: number * at_once for name, number in one.items()}
+
+
 def _table_bytes(kind: _Kind, sizes: _Sizes, geometry: Geometry, item: int) -> dict[str, float]:
     """What is held while a table of this kind is compressed."""
-    columns = item * kind.rows * sizes.products[kind.aside]
-    found = {"sketch": item * kind.rows * sketch_size(sizes.ranks[kind.aside])}
+    rows = kind.rows * sizes.joined
+    columns = item * rows * sizes.products[kind.aside]
+    found = {"sketch": item * rows * sketch_size(sizes.ranks[kind.aside])}
     if sizes.lit == 1:
         return found | {"columns_isolated": columns}
     # fine fields have far fewer terms a lenslet than products, and are narrowed to them; terms

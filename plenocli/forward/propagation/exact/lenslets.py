@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from plenocli.base.budget import spread
 from plenocli.forward.camera.quadrature import gauss, nodes_for
 from plenocli.forward.propagation.exact.debye import spherical_field
 from plenocli.forward.propagation.exact.interval_pairs import Interval, Pair, SensorSide
@@ -161,17 +162,23 @@ class ExactSquareLenslets(LensletFields):
         )
         self._sensor_sides: dict[tuple[int, int, bool], SensorSide] = {}
         self._intervals: dict[tuple[int, int, int, bool], Interval] = {}
+        pairs = self._pairs()
+        for sy, sx in pairs:  # what tables share is there before threads ask for it
+            for m, n in self._lit_by(sy, sx):
+                self._meet(sy, sx, m, n)
         self._tables: dict[tuple[int, int], Factors] = {}
-        counts = []
-        for sy, sx in self._pairs():
-            self._tables[sy, sx], products = self._compressed(sy, sx)
-            counts.append(products)
+        products: dict[tuple[int, int], int] = {}
+
+        def compress(sy: int, sx: int) -> None:
+            self._tables[sy, sx], products[sy, sx] = self._compressed(sy, sx)
+
+        spread(pairs[::-1], compress)
         self._intervals = {}
         self.notes = FieldNotes(
             separable_terms=max(t.high.shape[3] for t in self._tables.values()),
             field_tail=self._field.tail,
             psf_terms=self._field.terms,
-            products=max(counts),
+            products=max(products.values()),
         )
 
     # which lenslets light which superpixels
@@ -304,6 +311,19 @@ class ExactSquareLenslets(LensletFields):
         mirrored = gram[::-1, : len(g.points(axis)) - len(points)][:, ::-1]
         return np.concatenate([gram, mirrored], axis=1)
 
+    def _lit_by(self, sy: int, sx: int) -> list[tuple[int, int]]:
+        """Lenslets (row, column) whose light on a superpixel is computed; mirrored by the diagonal,
+        they are the others.
+        """
+        symmetric = self._turn and sy == sx
+        rows, columns = self._lenslets(sy, 0), self._lenslets(sx, 1)
+        return [(m, n) for m in rows for n in columns if not symmetric or m <= n]
+
+    def _meet(self, sy: int, sx: int, m: int, n: int) -> tuple[Interval, Interval]:
+        """Intervals of both axes from lenslet (m, n) to superpixel (sy, sx)."""
+        beside = bool(sy and sx)
+        return self._interval(sy, m, 0, beside), self._interval(sx, n, 1, beside)
+
     # products of two axes
 
     def _compressed(self, sy: int, sx: int) -> tuple[Factors, int]:
@@ -313,14 +333,8 @@ class ExactSquareLenslets(LensletFields):
         mean = math.prod(math.sqrt(np.mean(weight**2)) for weight in weights)
         cut = self.band.cut * mean**CONCENTRATION
         pairs = {
-            (m, n): Pair(
-                self._interval(sy, m, 0, beside),
-                self._interval(sx, n, 1, beside),
-                symmetric and m == n == sy,
-            )
-            for m in self._lenslets(sy, 0)
-            for n in self._lenslets(sx, 1)
-            if not symmetric or m <= n
+            (m, n): Pair(*self._meet(sy, sx, m, n), symmetric and m == n == sy)
+            for m, n in self._lit_by(sy, sx)
         }
         order = sorted(pairs, key=lambda key: pairs[key].weight)
         total = np.cumsum(
@@ -356,7 +370,7 @@ class ExactSquareLenslets(LensletFields):
         high, wide = product.factors(cut * math.sqrt(count), guess)
         if alone:
             high, wide = pair.on_pixels(high, wide)
-        products = max(c.shape[0] for c in couplings.values())
+        products = sum(x.shape[1] for x in left)
         return Factors(
             self._by_point(high, self._sensor_side(sy, 0, beside))[None],
             self._by_point(wide, self._sensor_side(sx, 1, beside))[None],

@@ -24,11 +24,11 @@ if TYPE_CHECKING:
 
 FILL = 0.85
 """Largest part of a sketch that the terms kept may fill."""
-NARROW, OVER = 3, 2
+NARROW, OVER = 2, 2
 """A product is narrowed where its terms fit a sketch of its factors' over the first; random
 combinations that this is told from, over that.
 """
-SMALL = 150
+SMALL = 40
 """Terms of factors that are not worth narrowing."""
 THIN = 1e-13
 """Entries of a coupling below this share of its largest are rounding of double precision."""

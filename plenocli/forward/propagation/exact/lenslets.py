@@ -61,7 +61,7 @@ SPILL = 0.25
 what a lenslet's far edge diffracts there is up to 0.23 of it (two cameras, f/4.4 and f/8).
 """
 
-DIM, CONCENTRATION = 4.0, 0.7
+DIM, CONCENTRATION = 4.0, 0.85
 """Errors of dim light may be as large as what adds so many cuts to the light by their own energy.
 Of the errors that are allowed to all points together those that count most take more than their
 share: 1 would leave them none of it, 0 all (worst columns of two cameras, 5e-2 to 1e-4, as before

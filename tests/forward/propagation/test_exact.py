@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from plenocli.base.budget import budget, within
 from plenocli.base.errors import NumericsError
 from plenocli.forward.accuracy import dial as accuracy
 from plenocli.forward.camera.geometry import geometry
@@ -737,3 +738,34 @@ def test_a_field_of_too_many_terms_is_refused_before_it_is_computed(monkeypatch)
         exact.exact_band(
             small_camera(), geometry(small_camera(), WAVELENGTH), (1, 1), 0, 1e-4, 1e-4
         )
+
+
+def test_superpixels_are_set_up_on_threads_with_the_same_bytes():
+    camera = small_camera()
+    plan = accuracy.plan_pif(
+        camera, model="exact", accuracy=1e-3, superpixels=(3, 3), coherent_ring=1
+    )
+    found = []
+    for threads in (1, 3):
+        with within(replace(budget(), threads=threads)):
+            found.append(PifBuilder(camera, WAVELENGTH, plan, dtype=np.float32).whole())
+    assert len(PifBuilder(camera, WAVELENGTH, plan).lenslets._tables) == 3
+    np.testing.assert_array_equal(*found)
+
+
+@pytest.mark.parametrize("nearer", [1.0, 0.97, 0.9])
+def test_errors_of_dim_light_count_no_less_than_it_shows(nearer):
+    """Weights of points on superpixels, from the light that enters each lenslet, against the light
+    that a fine matrix has there; in focus and out of it.
+    """
+    camera = small_camera()
+    camera = camera.replace(**{"object.distance": nearer * camera.object.distance})
+    plan = accuracy.plan_pif(
+        camera, model="exact", accuracy=1e-5, superpixels=(3, 3), coherent_ring=1
+    )
+    builder = PifBuilder(camera, WAVELENGTH, plan, dtype=np.float64)
+    light = builder.whole().sum(axis=1).reshape(3, 3, *builder.object_shape)
+    share = light.sum(axis=1).mean(axis=2)
+    share = share / share.sum(axis=0)
+    shown = np.minimum(1, np.sqrt(share / (share**2).sum(axis=0)))
+    assert (builder.lenslets._counted[0] >= 0.9 * shown).all()

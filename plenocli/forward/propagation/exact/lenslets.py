@@ -61,11 +61,12 @@ SPILL = 0.25
 what a lenslet's far edge diffracts there is up to 0.23 of it (two cameras, f/4.4 and f/8).
 """
 
-DIM, CONCENTRATION = 4.0, 0.85
-"""Errors of dim light may be as large as what adds so many cuts to the light by their own energy.
-Of the errors that are allowed to all points together those that count most take more than their
-share: 1 would leave them none of it, 0 all (worst columns of two cameras, 5e-2 to 1e-4, as before
-dim light was told apart).
+DIM, CONCENTRATION, WORST = 4.0, 0.7, 0.5
+"""On superpixels beside the own one. Errors of dim light may be as large as what adds so many cuts
+to the light by their own energy. Of what lenslets may lose, of all points together, those that
+count most take more than their share: 1 would leave them none of it, 0 all. No point may lose more
+than so many cuts where terms are left out. (Worst columns of two cameras, 5e-2 to 1e-4, as where
+all points count fully.)
 """
 
 LEAST = 1e-10
@@ -367,7 +368,12 @@ class ExactSquareLenslets(LensletFields):
                 couplings[first, first] = coupling
         right = left if symmetric else right
         product = Product(left, right, couplings, symmetric)
-        high, wide = product.factors(cut * math.sqrt(count), guess)
+        high, wide = product.factors(
+            self.band.cut * math.sqrt(count),
+            guess,
+            (len(weights[0]), len(weights[1])),
+            WORST * self.band.cut if sy or sx else math.inf,
+        )
         if alone:
             high, wide = pair.on_pixels(high, wide)
         products = sum(x.shape[1] for x in left)

@@ -9,6 +9,7 @@ combinations of both rows and columns show first how many of them it takes, and 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, TypeAlias
 
@@ -129,11 +130,15 @@ class Product:
         p, triangle = _triangle(seen[0])
         return p, triangle.T
 
-    def factors(self, cut: float, count: int) -> tuple[np.ndarray, np.ndarray]:
+    def factors(
+        self, cut: float, count: int, points: tuple[int, int] = (1, 1), worst: float = math.inf
+    ) -> tuple[np.ndarray, np.ndarray]:
         """The product compressed to its own rank, M = H B^T.
 
         cut: root sum of squares that may be lost;
-        count: columns of the first sketch.
+        count: columns of the first sketch;
+        points: of the object along both axes, over which M's rows and columns run fastest;
+        worst: root sum of squares that any one of them may lose.
 
         Returns (H, B).
         Raises NumericsError where no sketch of MAX_SKETCH columns holds M.
@@ -144,13 +149,14 @@ class Product:
             q, seen = self._extend(q, seen, size)
             p, core = self._core(q, seen)
             u, s, vh = np.linalg.svd(core)
-            terms = terms_within(s, cut)
-            root = np.sqrt(s[:terms])
-            u, v = u[:, :terms] * root, vh[:terms].T * root
+            root = np.sqrt(s)
+            high, wide = q @ (u * root), p @ (vh.T * root)
+            terms = max(terms_within(s, cut), _terms_of_all(high, wide, s, points, worst))
+            u, v = u[:, :terms] * root[:terms], vh[:terms].T * root[:terms]
             if size >= self.limit or (
                 terms <= FILL * size and self._missed(q, u @ v.T, p) <= 2 * cut
             ):
-                return q @ u, p @ v
+                return high[:, :terms].copy(), wide[:, :terms].copy()
             if size >= MAX_SKETCH:
                 raise NumericsError(
                     f"the exact field has more than {int(FILL * size)} separable terms",
@@ -213,6 +219,22 @@ class Product:
         )
         difference = exact - x[rows] @ core @ y[columns].T
         return float(np.sqrt((np.abs(difference) ** 2).mean() * len(x) * len(y)))
+
+
+def _terms_of_all(
+    high: np.ndarray, wide: np.ndarray, s: np.ndarray, points: tuple[int, int], worst: float
+) -> int:
+    """Terms of high wide^T, its columns by falling s, which they hold on either side, that it takes
+    until no point (row, column) loses more than `worst`.
+    """
+    if worst == math.inf:
+        return 1
+    # what terms bring to a point: they are orthogonal over all points, and all but so over one
+    rows, columns = (
+        (np.abs(x.reshape(-1, n, len(s))) ** 2).sum(axis=0).T for x, n in zip((high, wide), points)
+    )
+    lost = np.cumsum((rows[:, :, None] * columns[:, None, :])[::-1], axis=0)[::-1]
+    return max(1, int(np.count_nonzero(lost.max(axis=(1, 2)) > worst**2)))
 
 
 def _add_product(out: np.ndarray, x: np.ndarray, y: np.ndarray) -> None:

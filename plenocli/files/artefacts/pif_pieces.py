@@ -49,7 +49,8 @@ def cost(plan: PifPlan) -> tuple[bool, int]:
     within the budget of this process.
     """
     bands, superpixels = plan.shape[:2]
-    slab, work = plan.bytes // (bands * superpixels), max(0, plan.memory - plan.bytes)
+    slab = plan.bytes // (bands * superpixels)
+    work = max(0, plan.memory - plan.bytes) * (plan.at_once if plan.model == "exact" else 1)
     streamed = plan.bytes > min(WHOLE_BYTES, budget().memory // 4)
     diagnosed = diagnosis.memory(plan.shape)
     if streamed:  # piece by piece, while the fields are there

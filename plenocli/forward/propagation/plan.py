@@ -9,6 +9,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from plenocli.base.budget import budget
 from plenocli.forward.propagation.accuracy_record import AccuracyRecord
 
 NOMINAL_RATE = {False: 60e9, True: 30e9}
@@ -150,6 +151,14 @@ class PifPlan:
     def chosen(self) -> Candidate:
         """The candidate that is carried out."""
         return next(c for c in self.candidates if c.why is None)
+
+    @property
+    def at_once(self) -> int:
+        """Superpixels that an exact matrix is set up for at the same time: on as many threads as
+        the budget has, where its memory holds the work of each beside the result.
+        """
+        work, room = max(1, self.memory - self.bytes), budget().memory - 2 * self.bytes
+        return max(1, min(budget().threads, self.shape[1], room // work))
 
     def accuracy_record(self) -> AccuracyRecord:
         """What a result of this plan says of its accuracy."""

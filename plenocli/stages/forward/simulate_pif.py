@@ -257,30 +257,33 @@ def _write(task: _Task, job: _Job, output: Path | str) -> PifSummary:
     from plenocli.forward.propagation.system_matrix import build_pif
 
     camera, plan = job.camera, job.plan
-    chosen = pif_pieces.layout(plan, task.camera_path)
-    _announce(camera, plan, pif_pieces.cost(plan)[1], task.announced)
     provenance = _provenance(task.camera_path, camera, task.settings, plan, task.command)
 
     def finish(matrix: SystemMatrix, found: Diagnosis) -> Artefact:
         return _artefact(camera, task.settings, matrix, found, provenance)
 
     # the diagnosis too: its singular values must not depend on the cores of a machine
-    with (
-        one_thread(),
-        within(replace(budget(), threads=task.workers)),
-        bar(None, total=plan.shape[0] * plan.shape[3], label="columns of A") as shown,
-    ):
+    with one_thread(), within(replace(budget(), threads=task.workers)):
+        chosen = pif_pieces.layout(plan, task.camera_path)
+        _announce(camera, plan, pif_pieces.cost(plan)[1], task.announced)
+        with bar(None, total=plan.shape[0] * plan.shape[3], label="columns of A") as shown:
 
-        def progress(done: int, total: int) -> None:
-            shown.update(done - shown.n)
+            def progress(done: int, total: int) -> None:
+                shown.update(done - shown.n)
 
-        if chosen.streamed:
-            matrix, found = pif_pieces.stream_pif(
-                camera, plan, output, chosen, finish, overwrite=task.overwrite, progress=progress
-            )
-        else:
-            matrix = build_pif(camera, plan, progress=progress)
-            found = describe(matrix)
+            if chosen.streamed:
+                matrix, found = pif_pieces.stream_pif(
+                    camera,
+                    plan,
+                    output,
+                    chosen,
+                    finish,
+                    overwrite=task.overwrite,
+                    progress=progress,
+                )
+            else:
+                matrix = build_pif(camera, plan, progress=progress)
+                found = describe(matrix)
     for warning in found.warnings:
         note(warning)
     if not chosen.streamed:

@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from plenocli.base.budget import budget
 from plenocli.forward.propagation.costs import Features, summed
 from plenocli.forward.propagation.exact.oblique import field_work, orders_for
 from plenocli.forward.propagation.exact.term_counts import (
@@ -161,7 +160,7 @@ def features(
         summed(
             [seconds, field, *(_table_seconds(kind, sizes, wide, lenslets) for kind in sizes.kinds)]
         ),
-        tuple(held | _together(kind, sizes, geometry, item) for kind in sizes.kinds),
+        tuple(held | _table_bytes(kind, sizes, geometry, item) for kind in sizes.kinds),
     )
 
 
@@ -280,13 +279,6 @@ def _table_seconds(kind: _Kind, sizes: _Sizes, wide: float, lenslets: float) -> 
         "lenslet_phase": kept * sizes.phase,
         "lenslet_values": kept * sizes.nodes * sizes.across,
     }
-
-
-def _together(kind: _Kind, sizes: _Sizes, geometry: Geometry, item: int) -> dict[str, float]:
-    """What is held while as many threads as there are compress tables of at most this kind."""
-    at_once = min(budget().threads, sizes.tables)
-    one = _table_bytes(kind, sizes, geometry, item)
-    return {name: number * at_once for name, number in one.items()}
 
 
 def _table_bytes(kind: _Kind, sizes: _Sizes, geometry: Geometry, item: int) -> dict[str, float]:

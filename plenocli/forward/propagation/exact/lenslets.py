@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from plenocli.base.budget import spread
+from plenocli.base.budget import budget, spread, within
 from plenocli.forward.camera.quadrature import gauss, nodes_for
 from plenocli.forward.propagation.exact.debye import spherical_field
 from plenocli.forward.propagation.exact.interval_pairs import Interval, Pair, SensorSide
@@ -173,7 +174,8 @@ class ExactSquareLenslets(LensletFields):
         def compress(sy: int, sx: int) -> None:
             self._tables[sy, sx], products[sy, sx] = self._compressed(sy, sx)
 
-        spread(pairs[::-1], compress)
+        with within(replace(budget(), threads=plan.at_once)):
+            spread(pairs[::-1], compress)
         self._intervals = {}
         self.notes = FieldNotes(
             separable_terms=max(t.high.shape[3] for t in self._tables.values()),

@@ -43,6 +43,8 @@ from plenocli.files.artefacts.structure import (
 )
 from plenocli.files.outside import outside
 
+SHARE = 16
+"""Of the memory, one part: datasets up to that need not stay in their file."""
 _HEADER = re.compile(re.escape(MAGIC) + rb"sha256 ([0-9a-f]{64})\nbytes (\d{1,18})\n\0*\Z")
 _LOOK_S = 10
 """Processor time, s, in which HDF5 finds all objects of any file that is sound."""
@@ -101,17 +103,27 @@ class Stored:
     dtype: np.dtype
     schema: tables.Schema
 
+    @property
+    def is_small(self) -> bool:
+        """Whether all of it is less than a SHARE of the memory: then it may as well be held."""
+        return math.prod(self.shape) * self.dtype.itemsize <= budget().memory // SHARE
+
     def window(self, rows: slice = EVERYTHING, columns: slice = EVERYTHING) -> np.ndarray:
-        """Part of the last two axes.
+        """Part of the last two axes; errors as `part`."""
+        return self.part(*[EVERYTHING] * (len(self.shape) - 2), rows, columns)
+
+    def part(self, *sides: slice) -> np.ndarray:
+        """Part of the first axes, slices without a step.
 
         Raises InputError where it cannot be read or breaks the table, NumericsError where the
         memory of this process does not hold it.
         """
         seconds = _LOOK_S + self.path.stat().st_size // _SLOWEST
-        sides = [rows.indices(self.shape[-2])[:2], columns.indices(self.shape[-1])[:2]]
-        count = math.prod([*self.shape[:-2], *(last - first for first, last in sides)])
+        every = [*sides, *[EVERYTHING] * (len(self.shape) - len(sides))]
+        ends = [side.indices(n)[:2] for side, n in zip(every, self.shape)]
+        count = math.prod(last - first for first, last in ends)
         budget().require_reading(self.path, 2 * count * self.dtype.itemsize)
-        part = [*sides[0], *sides[1]]
+        part = [index for both in ends for index in both]
         values = outside(window, self.path, self.name, part, seconds=seconds)[self.name]
         problems = tables.value_problems(replace(self.schema, rules=()), {self.name: values})
         if problems:

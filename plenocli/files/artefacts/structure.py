@@ -82,13 +82,12 @@ def survey(
 
 
 def window(path: str, name: str, part: list[int]) -> dict[str, np.ndarray]:
-    """Rows and columns, first and last but one each, of a dataset's last two axes, by its name;
-    runs outside, as `reading.compressed_values`.
+    """A part of a dataset, first and last but one index on each of its axes, by its name; runs
+    outside, as `reading.compressed_values`.
     """
-    top, bottom, left, right = part
     try:
         with h5py.File(path, "r", locking=False) as file:
-            return {name: file[name][..., top:bottom, left:right]}
+            return {name: file[name][tuple(map(slice, part[::2], part[1::2]))]}
     except Exception as error:
         raise no_hdf5(path, error) from error
 

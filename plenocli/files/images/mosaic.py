@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from plenocli.base.errors import InputError
-from plenocli.base.tiling import InParts
+from plenocli.base.tiling import InParts, Plane
 from plenocli.files.artefacts.provenance import Provenance, first_bytes, provenance_texts
 from plenocli.files.images.containers import BIO, LYTRO, Contained, read_bio, read_lytro, read_pages
 from plenocli.files.images.dng import write_dng
@@ -70,14 +70,19 @@ def read_capture(path: str | Path, *, cfa: str | None = None) -> Capture:
     else:
         is_dng = kind == "tiff" and path.suffix.lower() == ".dng"
         found = _from_raw(path, "dng" if is_dng else "raw", read_raw(path))
-    if cfa is not None and found.cfa != cfa:
+    if cfa is not None:
+        _require_array(path, found, cfa)
+    _require_sound(path, found.mosaic)
+    return found
+
+
+def _require_array(path: str | Path, found: Capture, cfa: str) -> None:
+    if found.cfa != cfa:
         raise InputError(
             f"has the colour filter array {found.cfa}, not {cfa}",
             path,
             "leave the option out; the file knows it",
         )
-    _require_sound(path, found.mosaic)
-    return found
 
 
 def _require_sound(path: Path, mosaic: np.ndarray) -> None:
@@ -120,6 +125,18 @@ class StoredCapture:
         _require_sound(self.mosaic.path, values)
         first = (part.indices(side)[0] for part, side in zip((rows, columns), self.shape))
         return replace(self.about, mosaic=values, levels=self.about.levels.from_pixel(*first))
+
+
+def capture_in_file(path: str | Path, *, cfa: str) -> Capture:
+    """As read_capture, but that the mosaic of an artefact stays in its file, a Plane, where it is
+    not small.
+    """
+    with stored_capture(path) as stored:
+        if stored is None or stored.mosaic.is_small:
+            return read_capture(path, cfa=cfa)
+        _require_array(path, stored.about, cfa)
+        mosaic = Plane(stored.shape, lambda rows, columns: stored.window(rows, columns).mosaic)
+        return replace(stored.about, mosaic=mosaic)
 
 
 @contextlib.contextmanager

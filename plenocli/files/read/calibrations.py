@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from plenocli.base.errors import InputError
+from plenocli.base.tiling import Plane
 from plenocli.files.artefacts.container import Artefact
 from plenocli.files.artefacts.provenance import Provenance
-from plenocli.files.artefacts.reading import read_artefact
+from plenocli.files.artefacts.reading import Stored, opened_artefact, read_artefact
 from plenocli.files.artefacts.writing import write_artefact
 from plenocli.files.read.cameras import described_camera
 from plenocli.forward.sensor.frames import Dark
@@ -39,6 +41,8 @@ PARTS = {
 """Datasets that a file must have to hold a part."""
 WHITE_IMAGE = ("white/flat", "white/level")
 """The white image, which is large and which those do not need who have its superpixels."""
+LARGE = {"response/F", "response/white", "dark/mean"}
+"""Datasets that may stay in the file."""
 
 
 def read_calibration(
@@ -61,19 +65,60 @@ def read_calibration(
 
 
 def read_described(
-    path: str | Path, *, needs: tuple[str, ...]
+    path: str | Path, *, needs: tuple[str, ...], in_file: bool = False
 ) -> tuple[Calibration, Camera | None]:
     """A Calibration without its white image, and the camera as it was described to whoever made
     the file; None: it was not, or by more files than one.
 
     path, needs: as read_calibration's.
+    in_file: whether responses, superpixels of white and the dark image stay in the file where they
+        are not small.
     """
-    artefact = _read(path, needs, white_image=False)
-    return calibration_of(artefact), described_camera(artefact, path)
+    if not in_file:
+        artefact = _read(path, needs, white_image=False)
+        return calibration_of(artefact), described_camera(artefact, path)
+    apart = {*WHITE_IMAGE, *LARGE}
+    with opened_artefact(path, "calibration", apart) as (artefact, stored):
+        for name in LARGE & stored.keys():
+            artefact.data[name] = _in_file(stored[name], "response/polarised" in artefact.data)
+    return calibration_of(_sound(artefact, path, needs)), described_camera(artefact, path)
+
+
+def _in_file(values: Stored, told_apart: bool) -> Any:
+    """Values of LARGE, in memory where they are small or one for all lenslets.
+
+    told_apart: whether states of polarisation are, by all of a response.
+    """
+    if values.name == "dark/mean" and not values.is_small:
+        return Plane(values.shape, values.window)
+    own = len(values.shape) > 2 and not told_apart
+    return ByLenslet(values) if own and not values.is_small else values.part()
+
+
+class ByLenslet:
+    """Values of lenslets that stay in their file; plenocli.inverse.calibration.MadeResponses."""
+
+    def __init__(self, stored: Stored) -> None:
+        self.stored, self.shape, self.ndim = stored, stored.shape, len(stored.shape)
+
+    def __getitem__(self, places: tuple[np.ndarray, ...]) -> np.ndarray:
+        rows, columns = places
+        out = np.empty((len(rows), *self.shape[2:]), self.stored.dtype)
+        dense = 2 * len(rows) > math.prod(np.ptp(place) + 1 for place in places) if len(rows) else 0
+        for here in [np.arange(len(rows))] if dense else [rows == row for row in np.unique(rows)]:
+            sides = [slice(int(p[here].min()), int(p[here].max()) + 1) for p in places]
+            near = (place[here] - side.start for place, side in zip(places, sides))
+            out[here] = self.stored.part(*sides)[tuple(near)]
+        return out
 
 
 def _read(path: str | Path, needs: tuple[str, ...], white_image: bool) -> Artefact:
-    artefact = read_artefact(path, "calibration", skip=() if white_image else WHITE_IMAGE)
+    skip = () if white_image else WHITE_IMAGE
+    return _sound(read_artefact(path, "calibration", skip=skip), path, needs)
+
+
+def _sound(artefact: Artefact, path: str | Path, needs: tuple[str, ...]) -> Artefact:
+    """An artefact that holds what is needed; raises as read_calibration."""
     for part in needs:
         for name in PARTS[part]:
             if name not in artefact.data:

@@ -101,7 +101,7 @@ class Capture:
     """One exposure of a plenoptic camera, measured or simulated, never demosaiced.
 
     mosaic: (row, column) values as the sensor reports them; InParts only of a simulation whose
-        values are worked out while they are written.
+        values are worked out while they are written, a Plane only where they stay in their file.
     units: of the values: "DN", "electron", or "relative": 1 is the light of a white object point
         through the clear pupil.
     cfa: colour filter array, "mono" or the four letters of the top left 2x2 pixels, row by row.

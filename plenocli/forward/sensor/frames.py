@@ -5,12 +5,13 @@ masked, noise measured.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike
 
+from plenocli.base.tiling import EVERYTHING, Plane
 from plenocli.forward.sensor.noise import Noise
 
 # of the way from black to the white level: averaging electronics saturate softly
@@ -22,7 +23,7 @@ SAME_EXPOSURE = 0.01
 class Dark:
     """What the sensor reports without light.
 
-    mean: (row, column) DN at `exposure`.
+    mean: (row, column) DN at `exposure`; a Plane where it stays in its file.
     black: (2, 2) by position, DN.
     exposure: s, None where unknown.
     sigma: temporal noise of one frame, DN; None where no dark frame was given.
@@ -40,6 +41,10 @@ class Dark:
         """Whether the dark image is the black level everywhere."""
         level = np.asarray(self.black, self.mean.dtype)
         return all((self.mean[i::2, j::2] == level[i, j]).all() for i, j in np.ndindex(2, 2))
+
+    def rows(self, rows: slice) -> Dark:
+        """That of some rows of the sensor, from an even one on, in memory."""
+        return replace(self, mean=Plane.of(self.mean).read(rows, EVERYTHING))
 
     def growth(self, exposure: float | None) -> np.float32 | None:
         """Factor by which the part above the black level grows at another exposure (s), None where

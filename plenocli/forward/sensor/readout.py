@@ -7,20 +7,25 @@ stay in the cache.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from plenocli.base.tiling import EVERYTHING, Plane
 from plenocli.forward.sensor.frames import SATURATION, Dark
 from plenocli.forward.sensor.superpixel import inside
+
+BAND = 1 << 21
+"""Pixels that are read at a time of a sensor that stays in its file."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Readout:
     """A capture that gives its light by windows; `readout - number` has a larger offset.
 
-    values: (row, column) as the sensor reports them.
+    values: (row, column) as the sensor reports them; a Plane where they stay in their file.
     dark: what it reports without light.
     exposure_s: s, None where unknown.
     black: (2, 2) by position.
@@ -30,7 +35,7 @@ class Readout:
     ready: windows of the dark image that were cut before.
     """
 
-    values: np.ndarray
+    values: np.ndarray | Plane
     dark: Dark
     exposure_s: float | None
     black: np.ndarray
@@ -62,6 +67,8 @@ class Readout:
         self, origin: np.ndarray, window: tuple[int, ...]
     ) -> Callable[[np.ndarray | slice], np.ndarray]:
         """Function of an index or slice into `origin` that cuts those windows."""
+        if isinstance(self.values, Plane) or isinstance(self.dark.mean, Plane):
+            return lambda part: self._from_bands(origin[part], window)
         whole = inside(origin, window, self.shape)
         if whole.all():
             return _Cutter(self, origin, window)
@@ -73,6 +80,27 @@ class Readout:
             return light
 
         return cut
+
+    def _from_bands(self, origin: np.ndarray, window: tuple[int, ...]) -> np.ndarray:
+        """As `cut`, from bands of rows that are read one after the other."""
+        light = np.full((len(origin), math.prod(window)), np.nan, np.float32)
+        whole = np.flatnonzero(inside(origin, window, self.shape))
+        order = whole[np.argsort(origin[whole, 0], kind="stable")]
+        rows, at = origin[order, 0], 0
+        most = max(window[0], BAND // self.shape[1])
+        while at < len(order):
+            first = int(rows[at]) // 2 * 2  # colours and levels go by the parity of rows
+            end = max(at + 1, int(np.searchsorted(rows, first + most - window[0], "right")))
+            band = slice(first, int(rows[end - 1]) + window[0])
+            held = replace(
+                self,
+                values=Plane.of(self.values).read(band, EVERYTHING),
+                dark=self.dark.rows(band),
+                ready=None,
+            )
+            light[order[at:end]] = held.cut(origin[order[at:end]] - (first, 0), window)
+            at = end
+        return light
 
 
 class _Cutter:

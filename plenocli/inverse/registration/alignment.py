@@ -186,7 +186,6 @@ def moved_with(c: LensletResponses, motion: Motion) -> LensletResponses:
             origin=origin,
             variance=variance,
         )
-    assert isinstance(c.response, np.ndarray)  # as calibrated
     return replace(
         c,
         response=MovedResponses(c.response, c.origin, origin, rest, c.reference),

@@ -10,12 +10,15 @@ other radiances: neither is visible here. docs/model.md, "Registration".
 
 from __future__ import annotations
 
+import math
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from plenocli.forward.sensor.superpixel import extract, inside
 from plenocli.inverse.registration.reference import (
     REACH,
     Reference,
@@ -31,6 +34,8 @@ if TYPE_CHECKING:
     from plenocli.inverse.registration.smooth_response import SmoothResponses
 
 ITERATIONS = 8
+ROOM = REACH + ITERATIONS + 1
+"""px by which a window may move: the search, and at most a pixel in each iteration."""
 SIGNIFICANT = 4.0
 """Standard deviations from which something is more than chance."""
 CLOSE = 0.01
@@ -129,15 +134,50 @@ def motion_since(
     )
 
 
+class _Patches:
+    """Pixels around windows, cut out of a capture once, for windows that move by ROOM at most.
+
+    signal: (row, column), dark removed.
+    origin: (lenslet, 2), first pixels of the windows, on the sensor.
+    window: rows and columns, px.
+    """
+
+    def __init__(
+        self, signal: np.ndarray | Readout, origin: np.ndarray, window: tuple[int, int]
+    ) -> None:
+        size = np.minimum(np.asarray(window) + 2 * ROOM, signal.shape)
+        corner = np.clip(origin - ROOM, 0, np.asarray(signal.shape) - size)
+        rows, columns = (int(n) for n in size)
+        self.values = extract(signal, corner[:, None], (rows, columns)).reshape(-1, rows, columns)
+        self.start, self.window = origin - corner, window
+
+    def some(self, which: np.ndarray) -> _Patches:
+        """Those of some windows."""
+        part = copy(self)
+        part.values, part.start = self.values[which], self.start[which]
+        return part
+
+    def moved_by(self, whole: np.ndarray | int) -> np.ndarray:
+        """Pixels (lenslet, pixel) of windows moved by whole pixels, NaN off the sensor.
+
+        whole: (2,) or (lenslet, 2) px.
+        """
+        start = self.start + whole
+        good = np.flatnonzero(inside(start, self.window, self.values.shape[1:]))
+        out = np.full((len(start), math.prod(self.window)), np.nan, self.values.dtype)
+        view = np.lib.stride_tricks.sliding_window_view(self.values, self.window, axis=(1, 2))
+        out[good] = view[good, start[good, 0], start[good, 1]].reshape(len(good), -1)
+        return out
+
+
 class _LensletSample:
     """The lenslets that tell the motion: bright, whole and spread over the array."""
 
     def __init__(
         self, reference: Reference, signal: np.ndarray | Readout, noise: Noise | None
     ) -> None:
-        from plenocli.forward.sensor.superpixel import extract
-
-        values = extract(signal, reference.origin[:, None], reference.window)[:, 0]
+        patches = _Patches(signal, reference.origin, reference.window)
+        values = patches.moved_by(0)
         known = np.isfinite(values)
         values = np.where(known, values, 0)
         level, power = values.sum(axis=-1, dtype=float), np.vecdot(values, values)
@@ -150,10 +190,10 @@ class _LensletSample:
             else np.zeros(0, int)
         )
         self.which = bright[evenly(len(bright), reference.sample)]
-        self.reference, self.count, self.signal, self.window, self.noise = (
+        self.reference, self.count, self.patches, self.window, self.noise = (
             reference,
             len(self.which),
-            signal,
+            patches.some(self.which),
             reference.window,
             noise,
         )
@@ -179,12 +219,8 @@ class _LensletSample:
 
     def values(self, whole: np.ndarray) -> np.ndarray:
         """Values (lenslet, pixel) of windows moved by whole pixels, NaN at their borders."""
-        from plenocli.forward.sensor.superpixel import extract
-
         return np.where(
-            own_pixels(self.window),
-            extract(self.signal, (self.origin + whole)[:, None], self.window)[:, 0].astype(float),
-            np.nan,
+            own_pixels(self.window), self.patches.moved_by(whole).astype(float), np.nan
         )
 
     def search(self) -> np.ndarray:

@@ -44,7 +44,7 @@ class MovedResponses:
 
     def __init__(
         self,
-        response: np.ndarray,
+        response: np.ndarray | MadeResponses,
         before: np.ndarray,
         after: np.ndarray,
         rest: np.ndarray,
@@ -145,6 +145,31 @@ class WidenedResponses:
             else self._response[places]
         )
         return np.concatenate([own, more], axis=-1)
+
+
+class MixedResponses:
+    """Responses (lenslet_row, lenslet_column, pixel, mixed band) to mixtures of bands.
+
+    response: (lenslet_row, lenslet_column, pixel, band).
+    mixture: (band, mixed band).
+    """
+
+    def __init__(self, response: MadeResponses, mixture: np.ndarray) -> None:
+        self.shape, self.ndim = (*response.shape[:-1], mixture.shape[1]), response.ndim
+        self._response, self._mixture = response, mixture
+
+    def __getitem__(self, places: tuple[np.ndarray, ...]) -> np.ndarray:
+        own = self._response[places]
+        return own @ self._mixture.astype(own.dtype)
+
+
+def mixed(
+    response: np.ndarray | MadeResponses, mixture: np.ndarray
+) -> np.ndarray | MixedResponses:
+    """As MixedResponses, one array where the response is one."""
+    if isinstance(response, np.ndarray):
+        return response @ mixture.astype(response.dtype)
+    return MixedResponses(response, mixture)
 
 
 def widened(

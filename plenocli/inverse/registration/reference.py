@@ -82,14 +82,16 @@ class Reference:
         whole = inside(origin - REACH, (window[0] + 2 * REACH, window[1] + 2 * REACH), shape)
         place = np.argwhere(whole)
         place = place[evenly(len(place), 4 * sample)]
-        if response.ndim > 2 and len(place):
-            place = place[np.isfinite(response[tuple(place.T)]).all(axis=-1).mean(axis=-1) > 0.5]
+        self.shared = response.ndim == 2
+        own = np.asarray(response[None] if self.shared else response[tuple(place.T)], np.float32)
+        if not self.shared:
+            known = np.isfinite(own).all(axis=-1).mean(axis=-1) > 0.5
+            own, place = own[known], place[known]
         places = tuple(place.T)
         self.origin, self.centres = origin[places], centres[places]
-        self.shared = response.ndim == 2
         self.bases: dict[int, Basis] = {}
         self.variance = variance
-        self._response = np.asarray(response[None] if self.shared else response[places], np.float32)
+        self._response = own
         if not self.shared and len(self.origin):
             self._response = self._clean(self._response)
         corners = centres[np.isfinite(centres).all(axis=-1)].reshape(-1, 2)

@@ -16,6 +16,7 @@ import numpy as np
 from plenocli.forward.camera.pupil import filter_cells, filter_transmittance
 from plenocli.inverse.calibration.calibration import there
 from plenocli.inverse.calibration.quality import mean_of_known
+from plenocli.inverse.registration.moved_response import mixed
 from plenocli.inverse.spectra.responses import LensletResponses
 
 if TYPE_CHECKING:
@@ -139,9 +140,9 @@ def by_filter(calibration: Calibration, camera: Camera | None) -> Calibration:
         )
         for w in response.wavelengths
     ]
-    f = response.matrix
-    column = f if response.shared else mean_of_known(f[calibration.grid.valid])
-    light = LensletResponses.of(calibration).white_light
+    lenslets = LensletResponses.of(calibration)
+    column = lenslets.common if lenslets.shared else mean_of_known(lenslets.sampled_response)
+    light = lenslets.white_light
     if light is None or not min(lit) > 0:
         return calibration
     # what comes through a filter at the wavelength of each band, where lamps differ
@@ -157,7 +158,7 @@ def by_filter(calibration: Calibration, camera: Camera | None) -> Calibration:
         calibration,
         response=replace(
             response,
-            matrix=f @ mixture.astype(f.dtype),
+            matrix=mixed(response.matrix, mixture),
             variance=variance,
             mixture=mixture,
             energy=None,

@@ -187,7 +187,7 @@ def _common(
 
     if c.shared:
         return np.asarray(c.common, float), None
-    mean = np.asarray(mean_of_known(c.at(tuple(part[c.sample] for part in c.sites))), float)
+    mean = np.asarray(mean_of_known(c.sampled_response), float)
     step = max(1, BATCH_NUMBERS // mean.size)
 
     def own(radiance: np.ndarray) -> np.ndarray:

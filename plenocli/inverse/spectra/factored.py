@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -29,8 +29,8 @@ BLOCK_NUMBERS = 270_000, 45_000
 """Pixels of a block, one basis for all or one each: what belongs to it stays in a core's cache."""
 FACTOR_NUMBERS = 250_000
 """Numbers of responses that are factored together."""
-STREAMED_NUMBERS = 2_000_000
-"""Pixels whose factors are held at a time where none are kept."""
+TILE_NUMBERS = 4_000_000
+"""Of a tile, of its pixels or of responses of their own: what belongs to it is held at a time."""
 SMALL_PRODUCT = 1_000_000
 """Multiplications of a matrix product up to which OpenBLAS reads the matrices where they are; for
 larger ones it copies them first, which takes twice as long where the result has few columns.
@@ -49,26 +49,16 @@ pixel.
 class FactoredResponses:
     """Responses as F = Q R, of one lenslet each or one for all.
 
-    q: (lenslet or 1, band, pixel) float32, Q transposed; None where sums were made already.
+    q: (lenslet or 1, band, pixel) float32, Q transposed.
     r: (lenslet or 1, band, band).
     used: (lenslet or 1, pixel), which are known in every band; None: all.
     sound: (lenslet or 1,), condition number below 1e10.
     """
 
-    q: np.ndarray | None
+    q: np.ndarray
     r: np.ndarray
     used: np.ndarray | None
     sound: np.ndarray
-
-    @property
-    def basis(self) -> np.ndarray:
-        """q, where it was kept.
-
-        Raises ValueError where it was not, which is a mistake of the caller.
-        """
-        if self.q is None:
-            raise ValueError("the basis of these responses was not kept")
-        return self.q
 
     @property
     def shared(self) -> bool:
@@ -103,12 +93,12 @@ class FactoredResponses:
         first, last = np.searchsorted(rows, (part.start, part.stop))
         return rows[first:last] - part.start, pixels[first:last]
 
-    def some(self, which: np.ndarray) -> FactoredResponses:
+    def some(self, which: np.ndarray | slice) -> FactoredResponses:
         """The responses of lenslets by their index."""
         if self.shared:
             return self
         return FactoredResponses(
-            q=self.basis[which],
+            q=self.q[which],
             r=self.r[which],
             used=None if self.used is None else self.used[which],
             sound=self.sound[which],
@@ -226,6 +216,16 @@ def _orthogonal(f: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return q, r
 
 
+def tile_of(response: np.ndarray | MadeResponses) -> int:
+    """Lenslets that are demultiplexed together: whole blocks, whose rounding tiles do not change.
+
+    response: (pixel, band) for all, or (..., pixel, band).
+    """
+    own, pixels, bands = response.ndim > 2, *response.shape[-2:]
+    block = max(1, BLOCK_NUMBERS[own] // pixels)
+    return block * max(1, TILE_NUMBERS // (block * pixels * (bands if own else 1)))
+
+
 def normal_equations(
     factored: FactoredResponses,
     cut: Cut,
@@ -249,55 +249,17 @@ def normal_equations(
     sandwich: whether `spread` is wanted.
     """
     bands = factored.r.shape[-1]
-    basis = (_SharedBasis if factored.shared else _OwnBases)(factored.basis)
+    basis = (_SharedBasis if factored.shared else _OwnBases)(factored.q)
     variance = None if noise is None else _PixelVariance(factored, noise, response_variance, doubt)
-    out = NormalEquations.unfilled(total, bands, factored.basis.shape[-1], sandwich)
+    out = NormalEquations.unfilled(total, bands, factored.q.shape[-1], sandwich)
     if factored.used is not None:
         out.count[:] = factored.used.sum(axis=1)
-    step = max(1, BLOCK_NUMBERS[not factored.shared] // factored.basis.shape[-1])
+    step = max(1, BLOCK_NUMBERS[not factored.shared] // factored.q.shape[-1])
     for first in range(0, total, step):
         part = slice(first, min(first + step, total))
         given = None if radiance is None else radiance[part]
         _block(factored, basis, part, cut(part), variance, given, out)
     return out
-
-
-def streamed_equations(
-    response: np.ndarray | MadeResponses, which: tuple[np.ndarray, ...], cut: Cut, **settings: Any
-) -> tuple[FactoredResponses, NormalEquations]:
-    """Normal equations of superpixels whose responses serve one capture: never all of Q is held.
-
-    response, which: as factor's.
-    cut, settings: as normal_equations'.
-
-    Returns the factored responses without q, and the equations.
-    """
-    total = len(which[0])
-    step = max(1, STREAMED_NUMBERS // response.shape[-2])
-    factors, sums = [], []
-    for first in range(0, total, step):
-        part = slice(first, min(first + step, total))
-        own = settings | (
-            {"radiance": settings["radiance"][part]} if settings.get("radiance") is not None else {}
-        )
-        factored = factor(response, tuple(w[part] for w in which))
-        sums.append(
-            normal_equations(
-                factored,
-                lambda inner: cut(slice(first + inner.start, first + inner.stop)),
-                part.stop - first,
-                **own,
-            )
-        )
-        factors.append((factored.r, factored.sound))
-    r, sound = (np.concatenate(parts) for parts in zip(*factors))
-    joined: dict[str, Any] = {
-        one.name: None
-        if getattr(sums[0], one.name) is None
-        else np.concatenate([getattr(s, one.name) for s in sums])
-        for one in fields(NormalEquations)
-    }
-    return FactoredResponses(q=None, r=r, used=None, sound=sound), NormalEquations(**joined)
 
 
 def _block(
@@ -507,7 +469,7 @@ class _PixelVariance:
             None if v is None else np.ascontiguousarray(np.nan_to_num(v).T, np.float32)
             for v in (response_variance, doubt)
         )
-        constant = np.full((1, factored.basis.shape[-1]), self.read)
+        constant = np.full((1, factored.q.shape[-1]), self.read)
         self.patterns = constant if self.known is None else np.concatenate([constant, self.known])
 
     def of(

@@ -4,7 +4,6 @@ method asked for or the best one.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -13,9 +12,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from plenocli.base.errors import InputError, NumericsError
+from plenocli.base.tiling import bands
 from plenocli.forward.sensor.noise import Noise
 from plenocli.inverse.calibration.calibration import there
 from plenocli.inverse.spectra.bands import with_polarisation
+from plenocli.inverse.spectra.demultiplex import demultiplex, noise_variance
+from plenocli.inverse.spectra.factored import normal_equations, solve, tile_of
 from plenocli.inverse.spectra.spectra import Spectra, Trace
 
 if TYPE_CHECKING:
@@ -29,8 +31,6 @@ WORTHWHILE = 1.05
 """`auto` takes a method that assumes more only where it predicts a mean square error this much
 smaller.
 """
-BATCH_NUMBERS = 4_000_000
-"""Pixels of lenslets that are held at a time."""
 Prior = tuple[np.ndarray, np.ndarray]
 """Mean (band,) and covariance (band, band) of radiances."""
 
@@ -157,30 +157,23 @@ def estimate(
         )
     widened, prior = _with_stray(c, stray, prior, values)
     job = _Estimation(c=c, widened=widened, prior=prior, values=values, noise=noise, ratio=ratio)
-    if noise is None:
-        if method in ("wls", "lmmse"):
-            raise NumericsError(
-                f"{method} weighs pixels by their noise, which is not known",
-                fix="give the sensor's gain and read noise (--camera) or use pinv",
-            )
-        used, why = (
-            ("pinv", "the sensor's noise is not known")
-            if method == "auto"
-            else (method, "asked for")
+    if noise is None and method in ("wls", "lmmse"):
+        raise NumericsError(
+            f"{method} weighs pixels by their noise, which is not known",
+            fix="give the sensor's gain and read noise (--camera) or use pinv",
         )
-        sums = job.equations()
-    else:
-        used, why = (method, "asked for") if method != "auto" else job.best()
-        sums = job.weighted(None, sandwich=used == "pinv")
-    value, sigma = job.single_pixel(sums) if used == "single-pixel" else job.solved(sums, used)
+    used, why = method, "asked for"
+    if method == "auto":
+        used, why = ("pinv", "the sensor's noise is not known") if noise is None else job.best()
+    value, sigma, residual = job.answers(used)
     return Spectra(
-        value=np.moveaxis(job.spread_out(value[:, : job.bands]), -1, 0),
-        sigma=np.moveaxis(job.spread_out(sigma[:, : job.bands]), -1, 0),
+        value=np.moveaxis(value, -1, 0),
+        sigma=np.moveaxis(sigma, -1, 0),
         wavelength=c.wavelengths,
         quantity="radiance",
         method=used,
         trace=Trace(asked=method, reason=why),
-        residual=None if noise is None else job.residual(sums),
+        residual=None if noise is None else residual,
         states=c.states,
     )
 
@@ -195,8 +188,7 @@ def _with_stray(
         return c, prior
     from plenocli.inverse.registration.moved_response import widened
 
-    some = tuple(part[c.sample] for part in c.sites)
-    level = np.float32(max(float(np.nanmax(c.at(some))), 1e-30))
+    level = np.float32(max(float(np.nanmax(c.sampled_response)), 1e-30))
     count = stray.shape[-1]
     variance = (
         None
@@ -221,7 +213,7 @@ def _brightest(c: LensletResponses, values: Readout | np.ndarray) -> float:
 
 
 class _Estimation:
-    """One capture with its calibration.
+    """One capture with its calibration, whose lenslets are estimated tile by tile.
 
     c: the responses as they are.
     widened: with stray light as further bands; prior likewise.
@@ -239,60 +231,36 @@ class _Estimation:
         ratio: bool,
     ) -> None:
         self.c, self.widened, self.prior, self.noise, self.ratio = c, widened, prior, noise, ratio
+        self.values = values
         self.bands, self.unknowns = len(c.wavelengths), widened.response.shape[-1]
-        self.total = len(c.sites[0])
-        self.sample = c.sample
-        self.factored = None if widened.passing else widened.factored
-        self.cut: Callable[[Any], np.ndarray]
-        if isinstance(values, np.ndarray):
-            own = values[c.sites]
-            # lenslets by their index or a slice, free to be overwritten
-            self.cut = lambda which: np.array(own[which], np.float32)
-        else:
-            self.cut = values.cutter(c.corners, c.window)
 
-    def equations(self, which: np.ndarray | None = None, **settings: Any) -> NormalEquations:
-        """Normal equations of all lenslets, or those of an index array."""
-        from plenocli.inverse.spectra.factored import normal_equations, streamed_equations
+    def cut(self, which: np.ndarray | slice) -> np.ndarray:
+        """Superpixels (lenslet, pixel) float32 of lenslets, NaN where unknown."""
+        if isinstance(self.values, np.ndarray):
+            return np.asarray(self.values[tuple(s[which] for s in self.c.sites)], np.float32)
+        return self.values.cutter(self.c.corners, self.c.window)(which)
 
-        if which is None and self.widened.passing:
-            self.factored, sums = streamed_equations(
-                self.widened.response, self.widened.sites, self.cut, **settings
-            )
-            return sums
-        if which is None:
-            return normal_equations(self.widened.factored, self.cut, self.total, **settings)
-        return normal_equations(
-            self._some(which), lambda part: self.cut(which[part]), len(which), **settings
-        )
+    @cached_property
+    def sample(self) -> _Lenslets:
+        """Lenslets all over the array."""
+        return _Lenslets(self, self.c.sample, self.widened.sampled)
 
-    def _some(self, which: np.ndarray | None) -> FactoredResponses:
-        if which is None or which is self.sample:
-            return there(self.factored) if which is None else self.widened.sampled
-        if not self.widened.passing:
-            return self.widened.factored.some(which)
-        from plenocli.inverse.spectra.factored import factor
-
-        return factor(self.widened.response, tuple(part[which] for part in self.widened.sites))
-
-    def weighted(self, which: np.ndarray | None = None, sandwich: bool = True) -> NormalEquations:
-        """Normal equations weighted by the noise that is expected."""
-        known = self.widened.variance
-        settings = dict(
-            noise=self.noise,
-            response_variance=None if self.ratio else known,
-            doubt=known if self.ratio else None,
-            sandwich=sandwich,
-        )
-        if self.prior is None or not self.starved:
-            return self.equations(which, **settings)
-        count = self.total if which is None else len(which)
-        first = self.equations(
-            which, **settings | {"radiance": np.broadcast_to(self.prior[0], (count, self.unknowns))}
-        )
-        return self.equations(
-            which, **settings | {"radiance": np.nan_to_num(self.solved(first, "lmmse", which)[0])}
-        )
+    def answers(self, method: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(radiances, their standard deviations, (lenslet_row, lenslet_column, band) each; mean
+        square of the residuals over the expected one (lenslet_row, lenslet_column)) by one method,
+        NaN where they cannot be told.
+        """
+        shape = self.c.valid.shape
+        value, sigma = (np.full((*shape, self.bands), np.nan) for _ in range(2))
+        residual = np.full(shape, np.nan, np.float32)
+        for part in bands(len(self.c.sites[0]), tile_of(self.widened.response)):
+            tile = _Lenslets(self, part, self.widened.some(part))
+            sums = tile.equations() if self.noise is None else tile.weighted(method == "pinv")
+            found = tile.single_pixel(sums) if method == "single-pixel" else tile.solved(sums, method)
+            places = tuple(site[part] for site in self.c.sites)
+            value[places], sigma[places] = (one[:, : self.bands] for one in found)
+            residual[places] = tile.residual(sums)
+        return value, sigma, residual
 
     @cached_property
     def starved(self) -> bool:
@@ -301,13 +269,14 @@ class _Estimation:
         """
         if self.prior is None:
             return False
-        few = self.sample[:: max(1, len(self.sample) // 64)]
-        settings = dict(
+        few = self.c.sample[:: max(1, len(self.c.sample) // 64)]
+        lenslets = _Lenslets(self, few, self.widened.some(few))
+        sums = lenslets.equations(
             noise=self.noise,
             response_variance=None if self.ratio else self.widened.variance,
             sandwich=True,
         )
-        sigma = self.solved(self.equations(few, **settings), "pinv", few)[1]
+        sigma = lenslets.solved(sums, "pinv")[1]
         sigma = sigma[np.isfinite(sigma).all(axis=-1)]
         return not len(sigma) or bool(
             (
@@ -318,9 +287,9 @@ class _Estimation:
 
     def best(self) -> tuple[str, str]:
         """(method, reason) with the least predicted error."""
-        sums = self.weighted(self.sample)
+        sums = self.sample.weighted()
         tried = {
-            m: self.solved(sums, m, self.sample)[1][:, : self.bands]
+            m: self.sample.solved(sums, m)[1][:, : self.bands]
             for m in ("pinv", "wls", *(["lmmse"] if self.prior else []))
         }
         if not np.isfinite(tried["pinv"]).any():
@@ -332,45 +301,12 @@ class _Estimation:
                 ),
             )
         error = {m: float(np.nanmean(sigma**2)) for m, sigma in tried.items()}
-        error["single-pixel"] = self._single_pixel_error(self._radiance(sums, self.sample))
+        error["single-pixel"] = self._single_pixel_error(self.sample.radiance(sums))
         least = min(error.values())
         used = next(m for m in error if error[m] <= WORTHWHILE * least)
         return used, "predicted rms error of radiance " + ", ".join(
             f"{m} {np.sqrt(e):.3g}" for m, e in error.items()
         )
-
-    def solved(
-        self, sums: NormalEquations, method: str, which: np.ndarray | None = None
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """(radiances, standard deviations) of lenslets by one method; the few that single
-        precision cannot do, in double.
-        """
-        from plenocli.inverse.spectra.factored import solve
-
-        value, sigma = solve(self._some(which), sums, method, self.prior, self.noise is not None)
-        hard = np.flatnonzero(sums.hard)
-        if len(hard):
-            value[hard], sigma[hard] = self._double(hard if which is None else which[hard], method)
-        return value, sigma
-
-    def _double(self, which: np.ndarray, method: str) -> tuple[np.ndarray, np.ndarray]:
-        from plenocli.inverse.spectra.demultiplex import demultiplex, noise_variance
-
-        f = self.widened.at((self.c.sites[0][which], self.c.sites[1][which]))
-        x, variance = self.cut(which), None
-        if self.noise is not None:
-            b = demultiplex(f, x, "pinv")[0]
-            b = np.where(np.isfinite(b), b, 0.0 if self.prior is None else self.prior[0])
-            variance = np.maximum(
-                noise_variance(f, b, self.noise, None if self.ratio else self.widened.variance),
-                1e-12,
-            )
-        return demultiplex(f, x, method, variance=variance, prior=self.prior)
-
-    def _radiance(self, sums: NormalEquations, which: np.ndarray | None = None) -> np.ndarray:
-        """Radiances (lenslet, band) of the calibration's bands by unweighted least squares."""
-        b = (self._some(which).inverse @ sums.unweighted[..., None])[..., 0][:, : self.bands]
-        return np.where(sums.hard[:, None], np.nan, b)
 
     def _single_pixel_error(self, radiance: np.ndarray) -> float:
         """Mean square error that single-pixel extraction would make on the sample: crosstalk
@@ -384,42 +320,92 @@ class _Estimation:
             variance = self.noise.variance(own * radiance) / own**2
             return float(np.nanmean(bias**2 + variance))
 
+
+class _Lenslets:
+    """Some lenslets of one capture, cut out.
+
+    job: of all of them.
+    which: by their index among the valid ones.
+    factored: their responses.
+    """
+
+    def __init__(
+        self, job: _Estimation, which: np.ndarray | slice, factored: FactoredResponses
+    ) -> None:
+        self.job, self.which, self.factored = job, which, factored
+        self.values = job.cut(which)
+
+    def equations(self, **settings: Any) -> NormalEquations:
+        """Their normal equations."""
+        return normal_equations(
+            self.factored, lambda part: self.values[part].copy(), len(self.values), **settings
+        )
+
+    def weighted(self, sandwich: bool = True) -> NormalEquations:
+        """Normal equations weighted by the noise that is expected."""
+        job, known = self.job, self.job.widened.variance
+        settings = dict(
+            noise=job.noise,
+            response_variance=None if job.ratio else known,
+            doubt=known if job.ratio else None,
+            sandwich=sandwich,
+        )
+        if job.prior is None or not job.starved:
+            return self.equations(**settings)
+        even = np.broadcast_to(job.prior[0], (len(self.values), job.unknowns))
+        first = self.equations(**settings, radiance=even)
+        return self.equations(
+            **settings, radiance=np.nan_to_num(self.solved(first, "lmmse")[0])
+        )
+
+    def solved(self, sums: NormalEquations, method: str) -> tuple[np.ndarray, np.ndarray]:
+        """(radiances, standard deviations) by one method; the few that single precision cannot do,
+        in double.
+        """
+        value, sigma = solve(self.factored, sums, method, self.job.prior, self.job.noise is not None)
+        hard = np.flatnonzero(sums.hard)
+        if len(hard):
+            value[hard], sigma[hard] = self._double(hard, method)
+        return value, sigma
+
+    def _double(self, hard: np.ndarray, method: str) -> tuple[np.ndarray, np.ndarray]:
+        job = self.job
+        f = job.widened.at(tuple(site[self.which][hard] for site in job.c.sites))
+        x, variance = self.values[hard], None
+        if job.noise is not None:
+            b = demultiplex(f, x, "pinv")[0]
+            b = np.where(np.isfinite(b), b, 0.0 if job.prior is None else job.prior[0])
+            variance = np.maximum(
+                noise_variance(f, b, job.noise, None if job.ratio else job.widened.variance),
+                1e-12,
+            )
+        return demultiplex(f, x, method, variance=variance, prior=job.prior)
+
+    def radiance(self, sums: NormalEquations) -> np.ndarray:
+        """Radiances (lenslet, band) of the calibration's bands by unweighted least squares."""
+        b = (self.factored.inverse @ sums.unweighted[..., None])[..., 0][:, : self.job.bands]
+        return np.where(sums.hard[:, None], np.nan, b)
+
     def single_pixel(self, sums: NormalEquations) -> tuple[np.ndarray, np.ndarray]:
         """x[p] / F[p] at the calibrated pixels, sigma without the crosstalk bias; NaN sigma
         where the noise is not known.
         """
-        from plenocli.inverse.spectra.demultiplex import noise_variance
-
-        pixels, rows = self.c.pixels(slice(None))
-        pixels = np.broadcast_to(pixels, (self.total, self.bands))
-        step = max(1, BATCH_NUMBERS // self.c.response.shape[-2])
-        x = np.concatenate(
-            [
-                np.take_along_axis(self.cut(slice(s, s + step)), pixels[s : s + step], axis=1)
-                for s in range(0, self.total, step)
-            ]
-        ).astype(float)
+        c, noise = self.job.c, self.job.noise
+        pixels, rows = c.pixels(self.which)
+        pixels = np.broadcast_to(pixels, (len(self.values), self.job.bands))
+        x = np.take_along_axis(self.values, pixels, axis=1).astype(float)
         own = np.diagonal(rows, axis1=-2, axis2=-1)
         with np.errstate(divide="ignore", invalid="ignore"):
             b = np.where(own > 0, x / own, np.nan)
-            if self.noise is None:
+            if noise is None:
                 return b, np.full_like(b, np.nan)
-            known = None if self.ratio or self.c.variance is None else self.c.variance[pixels]
-            variance = noise_variance(rows, np.nan_to_num(self._radiance(sums)), self.noise, known)
+            known = None if self.job.ratio or c.variance is None else c.variance[pixels]
+            variance = noise_variance(rows, np.nan_to_num(self.radiance(sums)), noise, known)
             return b, np.where(np.isfinite(b), np.sqrt(np.maximum(variance, 1e-12)) / own, np.nan)
 
     def residual(self, sums: NormalEquations) -> np.ndarray:
-        """Mean square of the residuals over the expected one (lenslet_row, lenslet_column)."""
+        """Mean square (lenslet,) of the residuals over the expected one."""
+        freedom = sums.count - self.job.unknowns
         with np.errstate(invalid="ignore", divide="ignore"):
-            freedom = sums.count - self.unknowns
-            return self.spread_out(
-                np.where(
-                    (freedom > 0) & ~sums.hard, sums.chi / np.maximum(freedom, 1), np.nan
-                ).astype(np.float32)
-            )
-
-    def spread_out(self, values: np.ndarray) -> np.ndarray:
-        """Values by lenslet as an array (R, C, ...), NaN at lenslets that are not valid."""
-        out = np.full((*self.c.valid.shape, *values.shape[1:]), np.nan, values.dtype)
-        out[self.c.sites] = values
-        return out
+            power = sums.chi / np.maximum(freedom, 1)
+        return np.where((freedom > 0) & ~sums.hard, power, np.nan)

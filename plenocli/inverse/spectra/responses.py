@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from plenocli.base.tiling import bands
 from plenocli.inverse.calibration.calibration import Calibration, MadeResponses, there
 
 if TYPE_CHECKING:
@@ -35,7 +36,7 @@ class LensletResponses:
     variance: (pixel, band) of its entries; None: unknown.
     origin: (lenslet_row, lenslet_column, 2), first pixels of the windows that F belongs to.
     threads: for factoring it.
-    several: whether many captures follow, for which dark levels are kept cut out.
+    several: whether many captures follow, for which factors, and dark levels cut out, are kept.
     """
 
     calibration: Calibration
@@ -123,8 +124,8 @@ class LensletResponses:
 
     @property
     def passing(self) -> bool:
-        """Whether F is made lenslet by lenslet for one capture."""
-        return not isinstance(self.response, np.ndarray)
+        """Whether the factors of F are made tile by tile, for one capture, and not kept."""
+        return not isinstance(self.response, np.ndarray) or not (self.several or self.shared)
 
     @cached_property
     def sites(self) -> tuple[np.ndarray, ...]:
@@ -144,7 +145,7 @@ class LensletResponses:
         from plenocli.forward.sensor.readout import DarkWindows
         from plenocli.forward.sensor.superpixel import inside
 
-        if not self.several or self.dark.flat:
+        if not self.several or not isinstance(self.dark.mean, np.ndarray) or self.dark.flat:
             return None
         if not inside(self.corners, self.window, self.dark.mean.shape).all():
             return None
@@ -180,21 +181,30 @@ class LensletResponses:
             np.linspace(0, len(self.sites[0]) - 1, min(len(self.sites[0]), SAMPLE)).astype(int)
         )
 
-    @cached_property
-    def sampled(self) -> FactoredResponses:
-        """`factored` of the sample."""
+    def some(self, which: np.ndarray | slice) -> FactoredResponses:
+        """F = Q R of lenslets by their index among the valid ones."""
         from plenocli.inverse.spectra.factored import factor
 
-        return (
-            factor(self.response, tuple(part[self.sample] for part in self.sites))
-            if self.passing
-            else self.factored.some(self.sample)
-        )
+        if not self.passing:
+            return self.factored.some(which)
+        return factor(self.at(tuple(site[which] for site in self.sites)))
+
+    @cached_property
+    def sampled(self) -> FactoredResponses:
+        """`some` of the sample."""
+        from plenocli.inverse.spectra.factored import factor
+
+        return factor(self.sampled_response) if self.passing else self.some(self.sample)
+
+    @cached_property
+    def sampled_response(self) -> np.ndarray:
+        """`at` of the sample."""
+        return self.at(tuple(site[self.sample] for site in self.sites))
 
     @cached_property
     def sampled_pixels(self) -> tuple[np.ndarray, np.ndarray]:
         """`pixels` of the sample."""
-        return self.pixels(self.sample)
+        return _pixels(self.sampled_response[None] if self.shared else self.sampled_response)
 
     @property
     def white_light(self) -> np.ndarray | None:
@@ -203,7 +213,7 @@ class LensletResponses:
 
         white = there(there(self.calibration.white).superpixels)
         some = tuple(part[:: max(1, len(part) // LIT)] for part in self.sites)
-        if not self.shared:
+        if white.ndim > 1:
             white = white[some]
         light: np.ndarray = demultiplex(self.at(some), white, "pinv")[0]
         light = light.reshape(-1, len(self.wavelengths))
@@ -219,18 +229,14 @@ class LensletResponses:
         Returns the pixel of each band (lenslet or 1, band), and F there (lenslet or 1, pixel's
         band, band).
         """
-        from plenocli.inverse.spectra.demultiplex import choose_pixels
-
         if self.shared:
-            pixels = choose_pixels(self.common)[None]
-            return pixels, self.common[pixels].astype(float)
-        rows, columns = (part[which] for part in self.sites)
+            return _pixels(self.common[None])
+        places = tuple(site[which] for site in self.sites)
         step = max(1, BATCH_NUMBERS // int(np.prod(self.response.shape[-2:])))
-        found = []
-        for start in range(0, len(rows), step):
-            f = self.response[rows[start : start + step], columns[start : start + step]]
-            pixels = choose_pixels(f)
-            found.append((pixels, np.take_along_axis(f, pixels[..., None], axis=-2).astype(float)))
+        found = [
+            _pixels(self.at(tuple(p[part] for p in places)))
+            for part in bands(len(places[0]), step)
+        ]
         chosen, there = zip(*found)
         return np.concatenate(chosen), np.concatenate(there)
 
@@ -240,3 +246,11 @@ class LensletResponses:
         """
         _ = self.levels, self.reference.gains
         return self
+
+
+def _pixels(f: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """LensletResponses.pixels of F (lenslet, pixel, band)."""
+    from plenocli.inverse.spectra.demultiplex import choose_pixels
+
+    pixels = choose_pixels(f)
+    return pixels, np.take_along_axis(f, pixels[..., None], axis=-2).astype(float)

@@ -18,7 +18,7 @@ from plenocli.base.progress import note
 from plenocli.base.text import Record
 from plenocli.execution.batch import outcomes, plan_batch, summarise
 from plenocli.execution.pool import absolute, open_pool
-from plenocli.files.images.mosaic import read_capture
+from plenocli.files.images.mosaic import capture_in_file
 from plenocli.files.read.captures import describe_capture, named_captures
 from plenocli.forward.scene.white_reference import REFERENCE_REFLECTANCE
 from plenocli.inverse.spectra.bands import stokes
@@ -314,7 +314,7 @@ class CaptureDemultiplexer:
         self.settings, self.overwrite, self.command = settings, overwrite, command
         self.inputs = describe_inputs(_roles(calibration, settings))
         found, described = read_described(
-            calibration, needs=("response", "windows", "white", "dark")
+            calibration, needs=("response", "windows", "white", "dark"), in_file=True
         )
         self.solver = Demultiplexer(
             found,
@@ -343,7 +343,7 @@ class CaptureDemultiplexer:
 
         method: of a reference, whose misfit is told with each capture's.
         """
-        capture = read_capture(path, cfa=self.solver.responses.cfa)
+        capture = capture_in_file(path, cfa=self.solver.responses.cfa)
         found = self.solver.estimate(capture, path, method)
         if method is None:
             told = {str(path): found}

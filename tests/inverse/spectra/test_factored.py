@@ -8,7 +8,7 @@ import pytest
 import plenocli.inverse.spectra.factored as factored_module
 from plenocli.forward.sensor.noise import Noise
 from plenocli.inverse.spectra.demultiplex import demultiplex, noise_variance
-from plenocli.inverse.spectra.factored import factor, normal_equations, solve, streamed_equations
+from plenocli.inverse.spectra.factored import factor, normal_equations, solve
 
 LENSLETS, PIXELS, BANDS, GAIN, READ = 90, 20 * 20, 4, 0.4, 3.0
 NOISE = Noise(gain=GAIN, read_variance=READ)
@@ -160,27 +160,3 @@ def test_a_response_that_cannot_tell_bands_apart_gives_nothing():
     factored = factor(f)
     sums = normal_equations(factored, lambda part: np.ones((3, 30), np.float32)[part], 3)
     assert not factored.sound[0] and np.isnan(solve(factored, sums, "pinv", None, False)[0]).all()
-
-
-@pytest.mark.parametrize("known", [False, True])
-def test_sums_made_in_passing_are_those_of_all_factors_at_once(case, monkeypatch, known):
-    response, values, rng = case
-    response = np.broadcast_to(response, (LENSLETS, PIXELS, BANDS))
-    values[rng.uniform(size=values.shape) < 0.02] = np.nan
-    monkeypatch.setattr(factored_module, "STREAMED_NUMBERS", 17 * PIXELS)
-    radiance = rng.uniform(0, 1, (LENSLETS, BANDS)) if known else None
-    settings = dict(noise=NOISE, sandwich=True, radiance=radiance)
-    whole = factor(response)
-    expected = normal_equations(whole, lambda part: values[part].copy(), LENSLETS, **settings)
-    passing, sums = streamed_equations(
-        response, (np.arange(LENSLETS),), lambda part: values[part].copy(), **settings
-    )
-    for method in ("pinv", "wls", "lmmse"):
-        for ours, theirs in zip(
-            solve(passing, sums, method, PRIOR),
-            solve(whole, expected, method, PRIOR),
-            strict=True,
-        ):
-            np.testing.assert_allclose(ours, theirs, rtol=1e-6)
-    np.testing.assert_array_equal(sums.count, expected.count)
-    np.testing.assert_allclose(sums.chi, expected.chi, rtol=1e-6)

@@ -9,7 +9,6 @@ import plenocli.files.artefacts.reading as reading
 import plenocli.forward.sensor.readout as readout
 import plenocli.inverse.spectra.factored as factored
 from plenocli.base.budget import Budget, within
-from plenocli.base.errors import NumericsError
 from plenocli.files.artefacts.container import Artefact
 from plenocli.files.artefacts.provenance import Provenance
 from plenocli.files.artefacts.reading import read_artefact
@@ -31,9 +30,7 @@ def superpixels(moved):
     """(lenslet_row, lenslet_column, SIDE, SIDE, 2): a left and a right half, one band each with a
     leak of 3 %, displaced by `moved` (lenslet_row, lenslet_column, 2) px.
     """
-    y, x = (
-        np.arange(SIDE) - (SIDE - 1) / 2 - moved[..., axis, None] for axis in (0, 1)
-    )
+    y, x = (np.arange(SIDE) - (SIDE - 1) / 2 - moved[..., axis, None] for axis in (0, 1))
     edge = np.clip((6.2 - np.abs(y[..., :, None])) / 2, 0, 1)
     edge = edge * np.clip((6.2 - np.abs(x[..., None, :])) / 2, 0, 1)
     right = np.clip(0.5 + x[..., None, :] / 3, 0.03, 0.97)

@@ -135,7 +135,7 @@ def capture_in_file(path: str | Path, *, cfa: str) -> Capture:
         if stored is None or stored.mosaic.is_small:
             return read_capture(path, cfa=cfa)
         _require_array(path, stored.about, cfa)
-        mosaic = Plane(stored.shape, lambda rows, columns: stored.window(rows, columns).mosaic)
+        mosaic: Any = Plane(stored.shape, lambda rows, columns: stored.window(rows, columns).mosaic)
         return replace(stored.about, mosaic=mosaic)
 
 

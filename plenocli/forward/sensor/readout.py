@@ -109,6 +109,7 @@ class _Cutter:
     def __init__(self, readout: Readout, origin: np.ndarray, window: tuple[int, ...]) -> None:
         self.readout, self.origin, self.count = readout, origin, window[0] * window[1]
         dark = readout.dark
+        assert isinstance(readout.values, np.ndarray)  # bands of Planes are read before
         self.raw = np.lib.stride_tricks.sliding_window_view(readout.values, window)
         self.mean = None if dark.flat else DarkWindows(dark, origin, window)
         if readout.ready is not None and readout.ready.origin is origin:

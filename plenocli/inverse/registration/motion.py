@@ -219,9 +219,7 @@ class _LensletSample:
 
     def values(self, whole: np.ndarray) -> np.ndarray:
         """Values (lenslet, pixel) of windows moved by whole pixels, NaN at their borders."""
-        return np.where(
-            own_pixels(self.window), self.patches.moved_by(whole).astype(float), np.nan
-        )
+        return np.where(own_pixels(self.window), self.patches.moved_by(whole).astype(float), np.nan)
 
     def search(self) -> np.ndarray:
         """Displacement (2,) in whole pixels (an even number where there is a colour mosaic) that

@@ -65,7 +65,9 @@ class MovedResponses:
         out = (
             self._response[places]
             if self._response.ndim > 2
-            else np.array(np.broadcast_to(self._response, (len(places[0]), *self.shape[2:])))
+            else np.array(
+                np.broadcast_to(np.asarray(self._response), (len(places[0]), *self.shape[2:]))
+            )
         )
         rest, kinds = self._rest[places], self._reference.kinds(self._before[places])
         nodes = rest if self._even else np.rint(rest / NODES) * NODES
@@ -163,9 +165,7 @@ class MixedResponses:
         return own @ self._mixture.astype(own.dtype)
 
 
-def mixed(
-    response: np.ndarray | MadeResponses, mixture: np.ndarray
-) -> np.ndarray | MixedResponses:
+def mixed(response: np.ndarray | MadeResponses, mixture: np.ndarray) -> np.ndarray | MixedResponses:
     """As MixedResponses, one array where the response is one."""
     if isinstance(response, np.ndarray):
         return response @ mixture.astype(response.dtype)

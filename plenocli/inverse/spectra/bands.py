@@ -9,7 +9,7 @@ for such light, bands come out sharper than any filter. docs/model.md, section 9
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -154,11 +154,12 @@ def by_filter(calibration: Calibration, camera: Camera | None) -> Calibration:
         return calibration
     mixture = np.linalg.inv(amount)
     variance = None if response.variance is None else response.variance @ mixture**2
+    matrix: Any = mixed(response.matrix, mixture)
     return replace(
         calibration,
         response=replace(
             response,
-            matrix=mixed(response.matrix, mixture),
+            matrix=matrix,
             variance=variance,
             mixture=mixture,
             energy=None,

@@ -221,7 +221,7 @@ def tile_of(response: np.ndarray | MadeResponses) -> int:
 
     response: (pixel, band) for all, or (..., pixel, band).
     """
-    own, pixels, bands = response.ndim > 2, *response.shape[-2:]
+    own, (pixels, bands) = response.ndim > 2, response.shape[-2:]
     block = max(1, BLOCK_NUMBERS[own] // pixels)
     return block * max(1, TILE_NUMBERS // (block * pixels * (bands if own else 1)))
 

@@ -14,7 +14,6 @@ import numpy as np
 from plenocli.base.errors import InputError, NumericsError
 from plenocli.base.tiling import bands
 from plenocli.forward.sensor.noise import Noise
-from plenocli.inverse.calibration.calibration import there
 from plenocli.inverse.spectra.bands import with_polarisation
 from plenocli.inverse.spectra.demultiplex import demultiplex, noise_variance
 from plenocli.inverse.spectra.factored import normal_equations, solve, tile_of
@@ -256,7 +255,9 @@ class _Estimation:
         for part in bands(len(self.c.sites[0]), tile_of(self.widened.response)):
             tile = _Lenslets(self, part, self.widened.some(part))
             sums = tile.equations() if self.noise is None else tile.weighted(method == "pinv")
-            found = tile.single_pixel(sums) if method == "single-pixel" else tile.solved(sums, method)
+            found = (
+                tile.single_pixel(sums) if method == "single-pixel" else tile.solved(sums, method)
+            )
             places = tuple(site[part] for site in self.c.sites)
             value[places], sigma[places] = (one[:, : self.bands] for one in found)
             residual[places] = tile.residual(sums)
@@ -354,15 +355,15 @@ class _Lenslets:
             return self.equations(**settings)
         even = np.broadcast_to(job.prior[0], (len(self.values), job.unknowns))
         first = self.equations(**settings, radiance=even)
-        return self.equations(
-            **settings, radiance=np.nan_to_num(self.solved(first, "lmmse")[0])
-        )
+        return self.equations(**settings, radiance=np.nan_to_num(self.solved(first, "lmmse")[0]))
 
     def solved(self, sums: NormalEquations, method: str) -> tuple[np.ndarray, np.ndarray]:
         """(radiances, standard deviations) by one method; the few that single precision cannot do,
         in double.
         """
-        value, sigma = solve(self.factored, sums, method, self.job.prior, self.job.noise is not None)
+        value, sigma = solve(
+            self.factored, sums, method, self.job.prior, self.job.noise is not None
+        )
         hard = np.flatnonzero(sums.hard)
         if len(hard):
             value[hard], sigma[hard] = self._double(hard, method)

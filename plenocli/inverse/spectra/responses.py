@@ -234,8 +234,7 @@ class LensletResponses:
         places = tuple(site[which] for site in self.sites)
         step = max(1, BATCH_NUMBERS // int(np.prod(self.response.shape[-2:])))
         found = [
-            _pixels(self.at(tuple(p[part] for p in places)))
-            for part in bands(len(places[0]), step)
+            _pixels(self.at(tuple(p[part] for p in places))) for part in bands(len(places[0]), step)
         ]
         chosen, there = zip(*found)
         return np.concatenate(chosen), np.concatenate(there)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from plenocli.base.budget import budget
 from plenocli.base.errors import ConfigError, NumericsError, UsageError
 from plenocli.base.progress import note
 from plenocli.inverse.registration.alignment import align, believed, doubtful, misfit_told
@@ -21,7 +23,13 @@ from plenocli.inverse.spectra.crosstalk import (
     sensor_of,
     windows_of,
 )
-from plenocli.inverse.spectra.radiance import estimate, light_prior, readout
+from plenocli.inverse.spectra.radiance import (
+    estimate,
+    held_memory,
+    light_prior,
+    memory_by_tiles,
+    readout,
+)
 from plenocli.inverse.spectra.responses import LensletResponses
 
 if TYPE_CHECKING:
@@ -41,6 +49,10 @@ LEAST_STEP = 0.002
 """px, of a displacement that is worth another solution."""
 FOLLOWED = 0.02
 """px: neighbours' light is displaced by multiples of it."""
+PLANES, PLANES_OF_MOVED = 15, 25
+"""Numbers in single precision for each pixel of all superpixels that all lenslets together take, of
+a capture as calibrated and of one that moved (measured).
+"""
 TURNS = 2
 """Looks for motion, each with the neighbours' light as the last left it."""
 
@@ -157,6 +169,7 @@ class Demultiplexer:
         it explains more.
         """
         c = self.responses
+        self._require_together(signal, path, PLANES)
         best = self._crosstalk(c, light, windows_of(c, signal), noise)
         found: Registration | None = None
         last = best
@@ -170,6 +183,7 @@ class Demultiplexer:
             if tried is None or tried.motion is None or not tried.corrected:
                 found = found or tried
                 break
+            self._require_together(signal, path, PLANES_OF_MOVED)
             last = self._moved(light, aligned, tried.motion, signal, noise)
             if self.register == "auto" and not last.explains_more_than(best):
                 found = found or replace(tried, corrected=())
@@ -177,6 +191,12 @@ class Demultiplexer:
             best, found = last, tried
         spectra = best.spectra(method)
         return replace(spectra, trace=replace(spectra.trace, registration=found))
+
+    def _require_together(self, signal: Readout, path: Name, planes: int) -> None:
+        c = self.responses
+        needed = held_memory(c, signal) + 4 * planes * c.valid.size * math.prod(c.window)
+        fewer = "take --method pinv, by which lenslets are alone"
+        budget().require(needed, "demultiplexing all lenslets together", path, fewer)
 
     def _moved(
         self,
@@ -269,6 +289,8 @@ class Demultiplexer:
         levels: bool = True,
     ) -> Spectra:
         aligned = align(self.responses, signal, noise, mode, path, levels)
+        needed = memory_by_tiles(aligned.responses, signal)
+        budget().require(needed, "demultiplexing", path, "cut the capture")
         found = estimate(
             aligned.responses,
             aligned.signal,

@@ -4,6 +4,7 @@ method asked for or the best one.
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -29,6 +30,10 @@ if TYPE_CHECKING:
 WORTHWHILE = 1.05
 """`auto` takes a method that assumes more only where it predicts a mean square error this much
 smaller.
+"""
+NUMBER_BYTES, LENSLET_BYTES, MOVED_BYTES = 16, 300, 150
+"""Memory for each number of a tile, for each lenslet and, where responses are made for one capture,
+for each lenslet more (measured).
 """
 Prior = tuple[np.ndarray, np.ndarray]
 """Mean (band,) and covariance (band, band) of radiances."""
@@ -94,6 +99,22 @@ def readout(
     if gain is None:
         return signal, None
     return signal, Noise(gain=gain, read_variance=sensor.read_variance).scaled(scale)
+
+
+def held_memory(c: LensletResponses, signal: Readout) -> int:
+    """Bytes of what a capture and its calibration hold, but for what stays in files."""
+    parts = [signal.values, c.dark.mean, c.response]
+    held = sum(part.nbytes for part in parts if isinstance(part, np.ndarray))
+    factors = 0 if c.shared or c.passing else 4 * math.prod(c.response.shape)
+    return held + factors
+
+
+def memory_by_tiles(c: LensletResponses, signal: Readout) -> int:
+    """Bytes that `estimate` takes of a Readout, with what is held."""
+    lenslets, (pixels, bands) = len(c.sites[0]), c.response.shape[-2:]
+    numbers = min(lenslets, tile_of(c.response)) * pixels * (1 if c.shared else bands)
+    each = LENSLET_BYTES if isinstance(c.response, np.ndarray) else LENSLET_BYTES + MOVED_BYTES
+    return held_memory(c, signal) + NUMBER_BYTES * numbers + each * lenslets
 
 
 def light_prior(c: LensletResponses, known: LabelledSpectra | None = None) -> Prior | None:

@@ -4,6 +4,7 @@ stray light as further bands.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -23,8 +24,8 @@ LIT = 1024
 """Lenslets whose white tells the light."""
 SAMPLE = 256
 """Lenslets on which methods are compared."""
-BATCH_NUMBERS = 4_000_000
-"""Numbers of responses that are held at a time."""
+BATCH_NUMBERS = 1_000_000
+"""Numbers of responses that are made at a time."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,7 +121,14 @@ class LensletResponses:
         """F (lenslet, pixel, band) of lenslets by their rows and columns; (pixel, band) where one
         serves all.
         """
-        return self.common if self.shared else self.response[places]
+        if self.shared:
+            return self.common
+        if isinstance(self.response, np.ndarray):
+            return self.response[places]
+        found = np.empty((len(places[0]), *self.response.shape[-2:]), np.float32)
+        for part in bands(len(found), BATCH_NUMBERS // math.prod(found.shape[1:])):
+            found[part] = self.response[tuple(place[part] for place in places)]
+        return found
 
     @property
     def passing(self) -> bool:

@@ -122,9 +122,15 @@ def test_a_view_stands_where_its_samples_do():
     offset = np.stack(np.meshgrid(axis, axis, indexing="ij"), -1).reshape(-1, 2)
     offset = offset[(offset**2).sum(1) <= 36]
     places = view_places(count, 12.0, pitch)
-    centre = np.full_like(offset, pitch)
+    lenslet = np.zeros(len(offset), np.int32)
     for axis in (0, 1):
-        samples = Samples(centre=centre, offset=offset, value=offset[:, axis] / pitch, pitch=pitch)
+        samples = Samples(
+            centres=np.full((1, 2), pitch),
+            lenslet=lenslet,
+            offset=offset,
+            value=offset[:, axis] / pitch,
+            pitch=pitch,
+        )
         found = views(samples, count, (3, 3))[..., 1, 1]
         along = found.mean(axis=1 - axis)
         assert np.abs(along - places).max() < 0.002

@@ -127,14 +127,15 @@ class StoredCapture:
         return replace(self.about, mosaic=values, levels=self.about.levels.from_pixel(*first))
 
 
-def capture_in_file(path: str | Path, *, cfa: str) -> Capture:
+def capture_in_file(path: str | Path, *, cfa: str | None = None) -> Capture:
     """As read_capture, but that the mosaic of an artefact stays in its file, a Plane, where it is
     not small.
     """
     with stored_capture(path) as stored:
         if stored is None or stored.mosaic.is_small:
             return read_capture(path, cfa=cfa)
-        _require_array(path, stored.about, cfa)
+        if cfa is not None:
+            _require_array(path, stored.about, cfa)
         mosaic: Any = Plane(stored.shape, lambda rows, columns: stored.window(rows, columns).mosaic)
         return replace(stored.about, mosaic=mosaic)
 

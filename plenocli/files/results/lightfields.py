@@ -23,7 +23,7 @@ def lightfield_artefact(
     from plenocli.files.artefacts.container import Artefact
 
     data = {
-        "refocus/value": field.pictures.astype(np.float32),
+        "refocus/value": field.pictures.astype(np.float32, copy=False),
         "refocus/slope": field.slopes,
         "refocus/sharpness": field.sharpness,
         "refocus/distance": field.distances,
@@ -163,7 +163,7 @@ def _colours(colours: Colours) -> dict[str, Any]:
     """The datasets of colours."""
     channels = colours.channels
     data = {
-        "colour/value": colours.pictures.astype(np.float32),
+        "colour/value": colours.pictures.astype(np.float32, copy=False),
         "colour/to_rgb": channels.to_rgb,
         "colour/weight": channels.weights,
         "colour/wavelength": channels.wavelengths,

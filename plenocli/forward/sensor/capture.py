@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from plenocli.base.tiling import Plane
 from plenocli.forward.sensor.frames import tiled
 
 if TYPE_CHECKING:
@@ -145,7 +146,7 @@ class Capture:
         top, left = rows.indices(self.shape[0])[0], columns.indices(self.shape[1])[0]
         return replace(
             self,
-            mosaic=self.mosaic[rows, columns],
+            mosaic=Plane.of(self.mosaic).read(rows, columns),
             mask=None if self.mask is None else self.mask[rows, columns],
             levels=self.levels.from_pixel(top, left),
         )

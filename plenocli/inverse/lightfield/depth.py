@@ -108,7 +108,8 @@ def _own(samples: Samples, slope: np.ndarray) -> np.ndarray:
     """(sample,) slope of each sample's lenslet, from a map (row, column)."""
     from scipy.ndimage import map_coordinates
 
-    return map_coordinates(slope, samples.centre.T / samples.pitch - 0.5, order=1, mode="nearest")
+    places = samples.centres.T / samples.pitch - 0.5
+    return map_coordinates(slope, places, order=1, mode="nearest")[samples.lenslet]
 
 
 def _map(samples: Samples, tried: np.ndarray, disagreement: np.ndarray, width: float) -> DepthMap:
@@ -245,7 +246,7 @@ def _variance(samples: Samples, slope: float, shape: tuple[int, int], width: flo
     """Variance of what meets a point of a plane, two points a pitch, beyond that of the picture's
     own slant.
     """
-    floor = 1e-9 * float(np.mean(samples.value**2))
+    floor = 1e-9 * float(np.mean(samples.value**2, dtype=float))
     picture, variance = refocus(samples, slope, shape, step=2)
     for part in np.gradient(picture):
         variance = variance - (2 * part) ** 2 / 6  # a tent of a pitch to each side has 1/6
@@ -344,5 +345,6 @@ def _slants(
         cell = np.clip((part.centre / part.pitch).astype(int), 0, np.array(shape) - 1)
         index = cell[:, 0] * shape[1] + cell[:, 1]
         for total, weights in zip(sums, ((part.value - value) * along, along**2)):
-            total += np.bincount(index, weights, sums.shape[1])
+            first = index.min()
+            total[first : index.max() + 1] += np.bincount(index - first, weights)
     return sums[0].reshape(shape), sums[1].reshape(shape)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -9,6 +10,7 @@ import numpy as np
 
 from plenocli.base.budget import budget
 from plenocli.base.errors import InputError
+from plenocli.base.tiling import Plane
 from plenocli.forward.sensor.cfa import cfa_map
 from plenocli.inverse.lightfield.samples import AT_ONCE, Channels, Samples, collect, joined
 
@@ -16,9 +18,9 @@ if TYPE_CHECKING:
     from plenocli.forward.sensor.capture import Capture
     from plenocli.inverse.calibration.calibration import Calibration
 
-PIXEL_BYTES, PLANE_BYTES, TEMPORARY_BYTES = 92, 1, 34
-"""Memory for each pixel of the capture, for each of its pixels and each plane, and for each of the
-pixels that are worked on together (measured).
+PIXEL_BYTES, LENSLET_BYTES, PLANE_BYTES, TEMPORARY_BYTES = 14, 1150, 72, 40
+"""Memory for each pixel of the capture, for each lenslet, for each lenslet and each plane, and for
+each of the pixels that are worked on together (measured).
 """
 
 
@@ -42,9 +44,14 @@ def samples_of(
     suffice.
     docs/model.md, "Refocusing and depth".
     """
+    pixels = math.prod(capture.shape)
+    told = None if capture.grid is None else capture.grid.shape
+    side = float(np.mean(calibration.grid.pitch if calibration is not None else told or 1))
+    lenslets = pixels / side**2
     budget().require(
-        capture.mosaic.size * (PIXEL_BYTES + PLANE_BYTES * planes)
-        + min(capture.mosaic.size, AT_ONCE) * TEMPORARY_BYTES,
+        pixels * PIXEL_BYTES
+        + lenslets * (LENSLET_BYTES + PLANE_BYTES * planes)
+        + min(pixels, AT_ONCE) * TEMPORARY_BYTES,
         "refocusing",
         capture.metadata.path,
         "cut the capture",
@@ -53,8 +60,7 @@ def samples_of(
     if capture.cfa == "mono":
         samples = _grey(capture, calibration, where, None)[0]
     else:
-        colour = cfa_map((capture.shape[0], capture.shape[1]), capture.cfa)
-        found = [_grey(capture, calibration, where, colour == letter) for letter in letters]
+        found = [_grey(capture, calibration, where, letter) for letter in letters]
         light = np.array([level for _, level in found])
         matrix = np.eye(3) if capture.profile is None else capture.profile.to_rgb
         samples = joined(
@@ -125,9 +131,15 @@ def samples_of_spectra(
     for band, layer in enumerate(value):
         offset = corner + (middle[band] if response.shared else middle[..., band, :])
         used = grid.valid & np.isfinite(layer) & np.isfinite(offset).all(axis=-1)
-        seen = layer[used].astype(float)
+        seen = layer[used].astype(np.float32)
         parts.append(
-            Samples(centre=grid.centres[used], offset=offset[used], value=seen, pitch=pitch)
+            Samples(
+                centres=grid.centres[used],
+                lenslet=np.arange(len(seen), dtype=np.int32),
+                offset=offset[used].astype(np.float32),
+                value=seen,
+                pitch=pitch,
+            )
         )
     count = len(wavelengths)
     matrix = preview_rgb(wavelengths, np.eye(count)[:, :, None])[..., 0].astype(float)
@@ -157,37 +169,55 @@ def _grey(
     shot: Capture,
     calibration: Calibration | None,
     path: str | Path | None,
-    some: np.ndarray | None,
+    letter: str | None,
 ) -> tuple[Samples, float]:
-    """(samples, mean light of white) of the pixels `some` (row, column), or of all."""
+    """(samples, mean light of white) of the pixels of one colour, or of all."""
     if calibration is None:
-        return _along_tiles(shot, some)
-    return _along_grid(shot, calibration, path, some)
+        return _along_tiles(shot, letter)
+    return _along_grid(shot, calibration, path, letter)
+
+
+def _lit(white: np.ndarray, cfa: str, letter: str | None, corner: tuple[int, int]) -> np.ndarray:
+    """The light of white (row, column) of a part of the sensor, 0 where pixels have another colour.
+
+    corner: its first pixel.
+    """
+    if letter is None:
+        return white
+    colours = cfa_map((white.shape[0], white.shape[1]), cfa, (corner[0] % 2, corner[1] % 2))
+    return np.where(colours == letter, white, 0.0)
 
 
 def _along_grid(
-    shot: Capture, calibration: Calibration, path: str | Path | None, some: np.ndarray | None
+    shot: Capture, calibration: Calibration, path: str | Path | None, letter: str | None
 ) -> tuple[Samples, float]:
     """Samples along the grid of a calibration, relative to its white image."""
-    white = calibration.white
+    white, grid = calibration.white, calibration.grid
     if white is None or white.flat is None or white.flat.shape != shot.shape:
         raise InputError(
             "holds no white image of this sensor",
             path,
             "calibrate with the white image of the camera that took the capture",
         )
-    signal = shot.mosaic - (0.0 if calibration.dark is None else calibration.dark.mean)
     # the flat image is 1 in every superpixel: what light each has comes back
-    if white.level is not None:
-        signal = signal / float(np.nanmedian(white.level))
-    grid, flat = calibration.grid, np.nan_to_num(white.flat)
-    if some is not None:
-        flat = np.where(some, flat, 0.0)
-    made = collect(signal, flat, grid.centres, grid.valid, float(np.mean(grid.pitch)))
-    return made, float(flat.sum())
+    level = 1.0 if white.level is None else float(np.nanmedian(white.level))
+    mosaic, flat = Plane.of(shot.mosaic), Plane.of(white.flat)
+    dark = None if calibration.dark is None else Plane.of(calibration.dark.mean)
+
+    def light(rows: slice, columns: slice) -> np.ndarray:
+        own = 0.0 if dark is None else dark.read(rows, columns)
+        return (mosaic.read(rows, columns) - own) / level
+
+    def lit(rows: slice, columns: slice) -> np.ndarray:
+        corner = rows.start or 0, columns.start or 0
+        return _lit(np.nan_to_num(flat.read(rows, columns)), shot.cfa, letter, corner)
+
+    signal, shown = Plane(mosaic.shape, light), Plane(mosaic.shape, lit)
+    made = collect(signal, shown, grid.centres, grid.valid, float(np.mean(grid.pitch)))
+    return made, float(sum(shown.window(band).sum() for band in shown.in_bands()))
 
 
-def _along_tiles(shot: Capture, some: np.ndarray | None) -> tuple[Samples, float]:
+def _along_tiles(shot: Capture, letter: str | None) -> tuple[Samples, float]:
     """Samples along the superpixels that a simulated capture tells of, relative to what all of
     them have in common, which stands for a white image.
     """
@@ -198,20 +228,33 @@ def _along_tiles(shot: Capture, some: np.ndarray | None) -> tuple[Samples, float
             shot.metadata.path,
             "give --calibration (from calibrate) with the white image of this camera",
         )
-    count = [shot.shape[axis] // size[axis] for axis in (0, 1)]
-    counted = np.ones(shot.shape, bool) if some is None else some
-    signal, tiles = shot.signal(), (count[0], size[0], count[1], size[1])
-    seen = np.where(counted, signal, 0.0).reshape(tiles).sum(axis=(0, 2))
-    number = counted.reshape(tiles).sum(axis=(0, 2))
+    shape, count = (shot.shape[0], shot.shape[1]), [shot.shape[n] // size[n] for n in (0, 1)]
+
+    def light(rows: slice, columns: slice) -> np.ndarray:
+        return shot.window(rows, columns).signal()
+
+    seen, number = np.zeros(size), np.zeros(size)
+    signal = Plane(shape, light)
+    for rows in signal.in_bands(size[0]):
+        values = signal.window(rows)
+        counted = _lit(np.ones(values.shape), shot.cfa, letter, (rows.start, 0)) > 0
+        tiles = -1, size[0], count[1], size[1]
+        seen += np.where(counted, values, 0.0).reshape(tiles).sum(axis=(0, 2))
+        number += counted.reshape(tiles).sum(axis=(0, 2))
     mean = seen / np.maximum(number, 1)
-    places = ((np.arange(n) + 0.5) * s - 0.5 for n, s in zip(count, size))
     top = mean.max() if mean.max() > 0 else 1.0
-    flat = np.where(counted, np.tile(mean / top, count), 0.0)
+
+    def lit(rows: slice, columns: slice) -> np.ndarray:
+        down, right = (np.arange(*part.indices(n)) for part, n in zip((rows, columns), shape))
+        flat = (mean / top)[down[:, None] % size[0], right % size[1]]
+        return _lit(flat, shot.cfa, letter, (int(down[0]), int(right[0])))
+
+    places = ((np.arange(n) + 0.5) * s - 0.5 for n, s in zip(count, size))
     made = collect(
-        signal / top,
-        flat,
+        signal.through(lambda values: values / top),
+        Plane(shape, lit),
         np.stack(np.meshgrid(*places, indexing="ij"), axis=-1),
         np.ones(count, bool),
         float(np.mean(size)),
     )
-    return made, float(flat.sum() * top)
+    return made, float((number * mean).sum())

@@ -51,14 +51,22 @@ def refocused(
         found = depth(samples, slopes.tolist(), shape)
     if found is not None and optics is not None:
         found = in_metres(found, optics)
-    pictures = np.stack([focus.in_colour(samples, slope, shape) for slope in slopes])
+    channels = len(samples.parts())
+    points = tuple(focus.STEP * n for n in shape)
+    grey = np.empty((len(slopes), *points), np.float32)
+    coloured = np.empty((len(slopes), channels if samples.channels else 0, *points), np.float32)
+    sharpness = np.empty(len(slopes))
+    for number, slope in enumerate(slopes):
+        picture = focus.in_colour(samples, slope, shape)
+        mean = known_mean(picture, 0)
+        grey[number], coloured[number] = mean, picture[: coloured.shape[1]]
+        sharpness[number] = focus.sharpness(mean)
     sharp = None if found is None else all_in_focus(samples, found.slope, shape)
     seen = focus.views_in_colour(samples, views, shape) if views else None
-    grey = known_mean(pictures, 1)
     return LightField(
         pictures=grey,
         slopes=slopes,
-        sharpness=np.array([focus.sharpness(p) for p in grey]),
+        sharpness=sharpness,
         distances=None if optics is None else optics.distance(slopes),
         spacing=None if optics is None else optics.spacing,
         microscope=isinstance(optics, MicroscopeOptics),
@@ -67,7 +75,7 @@ def refocused(
         views=None if seen is None else known_mean(seen, 2),
         colours=None
         if samples.channels is None
-        else Colours(channels=samples.channels, pictures=pictures, sharp=sharp, views=seen),
+        else Colours(channels=samples.channels, pictures=coloured, sharp=sharp, views=seen),
     )
 
 

@@ -25,7 +25,9 @@ def views(
     """
     half = (samples.reach() if reach is None else reach) * np.sqrt(0.5)
     edges = np.linspace(-half, half, count + 1) * (1 + 1e-9)  # the outermost are counted
-    part_of = np.digitize(samples.offset, edges) - 1
+    part_of = np.stack(
+        [(np.digitize(along, edges) - 1).astype(np.int8) for along in samples.offset.T], axis=-1
+    )
     found = np.zeros((count, count, *shape))
     for row in range(count):
         for column in range(count):
@@ -87,7 +89,7 @@ def refocus(
     rows, columns = shape[0] * step, shape[1] * step
     sums, each = np.zeros((3, rows * columns)), np.asarray(slope, float)
     for some in bands(len(samples.value), AT_ONCE):
-        values = samples.value[some]
+        values = samples.value[some].astype(float)
         where = place(samples.where(some), each[some] if each.ndim else each, step)
         low = np.floor(where).astype(int)
         part = where - low
@@ -96,8 +98,11 @@ def refocus(
             share = np.abs(1 - down - part[:, 0]) * np.abs(1 - right - part[:, 1])
             inside = (r >= 0) & (r < rows) & (c >= 0) & (c < columns)
             index, share, value = (r * columns + c)[inside], share[inside], values[inside]
-            for total, weights in zip(sums, (share, share * value, share * value**2)):
-                total += np.bincount(index, weights, rows * columns)
+            if len(index):
+                first = index.min()  # a band of lenslets meets a band of the picture
+                last = index.max() + 1
+                for total, weights in zip(sums, (share, share * value, share * value**2)):
+                    total[first:last] += np.bincount(index - first, weights)
     tent = 1 - np.abs(np.arange(1 - step, step)) / step
     weight, first, second = (
         convolve1d(

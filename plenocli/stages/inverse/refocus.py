@@ -189,7 +189,7 @@ def _samples(
     capture: Path, calibration: Path | None, planes: int
 ) -> tuple[Samples, tuple[int, int]]:
     """Samples of a capture, or of spectra that demux made of one, and the shape of a picture."""
-    from plenocli.files.images.mosaic import read_capture
+    from plenocli.files.images.mosaic import capture_in_file
     from plenocli.files.opened_file import open_file
     from plenocli.files.read.calibrations import read_calibration
     from plenocli.files.results.results import read_result
@@ -208,7 +208,7 @@ def _samples(
         known = read_calibration(calibration)
         return samples_of_spectra(spectra.values, spectra.wavelengths, known, where=calibration)
     found = None if calibration is None else read_calibration(calibration, response=False)
-    return samples_of(read_capture(capture), found, planes=planes, where=calibration)
+    return samples_of(capture_in_file(capture), found, planes=planes, where=calibration)
 
 
 def _told(depth: DepthMap | None, slopes: np.ndarray) -> tuple[float | None, float | None]:

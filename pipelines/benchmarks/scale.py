@@ -1,8 +1,10 @@
-"""Time, memory and bytes of whole sensors: capture-sim and reconstruct against lenslets, points and
-workers.
+"""Time, memory and bytes of whole sensors: capture-sim, reconstruct, demux and refocus against
+lenslets, points and workers.
 
 Cameras are seed_spatial with more lenslets (`seed`: 52x52 pixels and 40x40 points a lenslet, or
-`small`: 15x15 and 12x12), the scene is the astronaut spread over all lenslets at 50 dB. Every
+`small`: 15x15 and 12x12), the scene is the astronaut spread over all lenslets at 50 dB; methods are
+those of reconstruct, and `refocus`. `spectral` is seed_spectral with 15x15 pixels a lenslet, which
+is calibrated (a response of its own for every lenslet); methods are those of demux. Every
 command is a process of its own, of one thread; its CPU seconds (user and system, workers
 included), seconds by the clock, its highest resident memory and the bytes of its file are lines
 of RUN/scale.jsonl. What stands there is not measured again. RUN/scale.md has the table, with the
@@ -12,12 +14,15 @@ is measured, too, in turn.
 
 Run from the project's root:
 python pipelines/benchmarks/scale.py RUN --kind small --lenslets 1024 4096 16384 65536 129960
+python pipelines/benchmarks/scale.py RUN --kind spectral --methods pinv --mem-limit 512MiB \
+    --lenslets 16384 65536 129960
 """
 
 import argparse
 import json
 import math
 import os
+import re
 import subprocess
 import sys
 import time
@@ -26,21 +31,25 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 SMALL = {
     "samples_per_lenslet = [40, 40]": "samples_per_lenslet = [12, 12]",
+    "samples_per_lenslet = [12, 12] ": "samples_per_lenslet = [6, 6] ",
     "pixels_per_lenslet = [52, 52]": "pixels_per_lenslet = [15, 15]",
     '"104 um"': '"30 um"',
     '"832 um"': '"240 um"',
 }
+BANDS = "450nm", "540nm", "570nm", "650nm"
 WHOLE = 130_000
 
 
 def described(kind, lenslets):
     """The camera's description, TOML, and how many lenslets it has: as square as can be."""
-    text = (ROOT / "sample_configs/seed_spatial.toml").read_text()
-    for old, new in SMALL.items() if kind == "small" else ():
+    name = "seed_spectral" if kind == "spectral" else "seed_spatial"
+    text = (ROOT / f"sample_configs/{name}.toml").read_text()
+    for old, new in SMALL.items() if kind != "seed" else ():
         text = text.replace(old, new)
     rows = int(lenslets**0.5)
     columns = max(1, round(lenslets / rows))
-    return text.replace("count = [11, 11]", f"count = [{rows}, {columns}]"), rows * columns
+    there = r"(?m)^count = \[\d+, \d+\]"
+    return re.sub(there, f"count = [{rows}, {columns}]", text), rows * columns
 
 
 def measured(tree, command):
@@ -58,6 +67,9 @@ def measured(tree, command):
 
 def commands(run, kind, lenslets, chosen):
     """(name, command, its file) of one size; the matrix serves all sizes of a kind."""
+    if kind == "spectral":
+        yield from spectral_commands(run, lenslets, chosen)
+        return
     text, count = described(kind, lenslets)
     superpixels, limit = chosen.superpixels, chosen.mem_limit
     kind = f"{kind}-{superpixels}"
@@ -70,8 +82,37 @@ def commands(run, kind, lenslets, chosen):
     yield count, "capture-sim", ["capture-sim", camera, *scene, "-o", shot, *limits], shot
     for method in chosen.methods:
         out = run / f"{kind}-{count}-{method}.h5"
-        options = ["--pif", pif, "--method", method, "-o", out, *limits]
-        yield count, method, ["reconstruct", shot, *options], out
+        options = ["--pif", pif, "--method", method]
+        command = ["refocus", shot] if method == "refocus" else ["reconstruct", shot, *options]
+        yield count, method, [*command, "-o", out, *limits], out
+
+
+def spectral_commands(run, lenslets, chosen):
+    """As commands, of demux; targets and calibration are made beside the capture."""
+    text, count = described("spectral", lenslets)
+    camera, limits = run / f"spectral-{count}.toml", ["--mem-limit", chosen.mem_limit]
+    camera.write_text(text)
+
+    def take(what, name):
+        shot = run / f"spectral-{count}-{name}.h5"
+        expose = ["capture-sim", camera, *what, "--superpixels", "1x1"]
+        return [*expose, "-o", shot, "--overwrite"], shot
+
+    command, shot = take(["--scene", "skimage:astronaut"], "shot")
+    yield count, "capture-sim", [*command, *limits], shot
+    calibration = run / f"spectral-{count}-calibration.h5"
+    if not calibration.exists():
+        of = {}
+        for name in ("white", "dark", *BANDS):
+            command, of[name] = take(["--target", f"mono:{name}" if name in BANDS else name], name)
+            measured(ROOT, command)
+        bands = [word for band in BANDS for word in ("--band", f"{band}={of[band]}")]
+        frames = ["--white", of["white"], "--dark", of["dark"], *bands]
+        measured(ROOT, ["calibrate", *frames, "--response", "own", "-o", calibration])
+    for method in chosen.methods:
+        out = run / f"spectral-{count}-{method}.h5"
+        options = ["--calibration", calibration, "--method", method, "-o", out, "--overwrite"]
+        yield count, f"demux {method}", ["demux", shot, *options, *limits], out
 
 
 def exponents(lines):
@@ -113,7 +154,7 @@ def main():
     """Measure what is not measured yet, and write the table."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("run", type=Path)
-    parser.add_argument("--kind", choices=["seed", "small"], default="small")
+    parser.add_argument("--kind", choices=["seed", "small", "spectral"], default="small")
     parser.add_argument("--lenslets", type=int, nargs="+", default=[121, 1024, 4096])
     parser.add_argument("--methods", nargs="+", default=["lmmse"])
     parser.add_argument("--workers", type=int, nargs="+", default=[1])
@@ -126,7 +167,7 @@ def main():
     log = run / "scale.jsonl"
     lines = [json.loads(text) for text in log.read_text().splitlines()] if log.exists() else []
     trees = {"new": ROOT} | ({"old": chosen.old.resolve()} if chosen.old else {})
-    kind = f"{chosen.kind} {chosen.superpixels}"
+    kind = chosen.kind if chosen.kind == "spectral" else f"{chosen.kind} {chosen.superpixels}"
     for lenslets in chosen.lenslets:
         jobs = commands(run, chosen.kind, lenslets, chosen)
         for count, name, command, file in jobs:

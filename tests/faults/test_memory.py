@@ -37,7 +37,7 @@ WATCHED = (
 SIZES = {
     "simulate-pif": (24, 28, 32),
     "capture-sim": (60, 90, 120),
-    "refocus": (30, 45, 60),
+    "refocus": (45, 60, 120),
     "reconstruct": (32, 36, 40),
     "learn-dict": (24, 28, 32),
 }

@@ -9,6 +9,7 @@ import plenocli.files.artefacts.reading as reading
 import plenocli.forward.sensor.readout as readout
 import plenocli.inverse.spectra.factored as factored
 from plenocli.base.budget import Budget, within
+from plenocli.base.errors import NumericsError
 from plenocli.files.artefacts.container import Artefact
 from plenocli.files.artefacts.provenance import Provenance
 from plenocli.files.artefacts.reading import read_artefact
@@ -121,6 +122,15 @@ def test_tiles_give_what_one_piece_gives(files, tmp_path, monkeypatch, shot, met
     assert (again.method, again.reason) == (summary.method, summary.reason)
     for name, values in whole.items():
         np.testing.assert_allclose(parts[name], values, rtol=2e-5, atol=1e-9, err_msg=name)
+
+
+def test_what_tiles_do_not_fit_is_refused_with_what_would_do(files, tmp_path):
+    with (
+        within(Budget(2 << 20)),
+        pytest.raises(NumericsError, match="demultiplexing needs about .* raise --mem-limit to"),
+    ):
+        spectra(files, tmp_path, "moved", "pinv")
+    assert not (tmp_path / "o.h5").exists()
 
 
 def test_what_is_small_beside_the_memory_is_held_and_what_is_not_stays_in_the_file(files):

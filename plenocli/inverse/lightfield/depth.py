@@ -109,7 +109,8 @@ def _own(samples: Samples, slope: np.ndarray) -> np.ndarray:
     from scipy.ndimage import map_coordinates
 
     places = samples.centres.T / samples.pitch - 0.5
-    return map_coordinates(slope, places, order=1, mode="nearest")[samples.lenslet]
+    own = map_coordinates(slope, places, order=1, mode="nearest")
+    return own.astype(np.float32)[samples.lenslet]
 
 
 def _map(samples: Samples, tried: np.ndarray, disagreement: np.ndarray, width: float) -> DepthMap:

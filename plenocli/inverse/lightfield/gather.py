@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from plenocli.forward.sensor.capture import Capture
     from plenocli.inverse.calibration.calibration import Calibration
 
-PIXEL_BYTES, LENSLET_BYTES, PLANE_BYTES, TEMPORARY_BYTES = 14, 1150, 72, 40
+PIXEL_BYTES, LENSLET_BYTES, PLANE_BYTES, TEMPORARY_BYTES = 14, 1150, 72, 140
 """Memory for each pixel of the capture, for each lenslet, for each lenslet and each plane, and for
 each of the pixels that are worked on together (measured).
 """

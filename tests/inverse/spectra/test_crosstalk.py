@@ -3,6 +3,7 @@ quite its own.
 """
 
 import functools
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 import plenocli.api as pc
+from plenocli.base.budget import Budget, within
 from plenocli.base.errors import ConfigError, NumericsError, UsageError
 from plenocli.forward.accuracy.dial import pif_builder
 from plenocli.forward.scene.light import Quadrature, narrow_band
@@ -294,6 +296,19 @@ def test_without_noise_figures_pixels_are_not_weighed(bench, checkerboard):
     shot = replace(shot, noise=None, levels=replace(shot.levels, gain=None))
     with pytest.raises(NumericsError, match="not known"):
         Demultiplexer(blind, method="coupled", camera=camera, ratio=True).estimate(shot, "x")
+
+
+def test_all_lenslets_together_are_refused_where_they_do_not_fit(bench, checkerboard):
+    camera, calibration, _, _ = bench
+    pixels = math.prod(calibration.response.matrix.shape[-2:-1]) * calibration.grid.valid.size
+    for planes, refused in ((2, True), (40, False)):
+        solver = Demultiplexer(calibration, method="coupled", camera=camera, ratio=True)
+        with within(Budget(4 * planes * pixels)):
+            if not refused:
+                assert solver.estimate(checkerboard[1], "x").method == "coupled"
+                continue
+            with pytest.raises(NumericsError, match="all lenslets together.*--method pinv"):
+                solver.estimate(checkerboard[1], "x")
 
 
 @pytest.mark.slow

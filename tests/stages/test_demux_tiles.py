@@ -126,7 +126,7 @@ def test_tiles_give_what_one_piece_gives(files, tmp_path, monkeypatch, shot, met
 
 def test_what_tiles_do_not_fit_is_refused_with_what_would_do(files, tmp_path):
     with (
-        within(Budget(2 << 20)),
+        within(Budget(450 << 10)),
         pytest.raises(NumericsError, match="demultiplexing needs about .* raise --mem-limit to"),
     ):
         spectra(files, tmp_path, "moved", "pinv")

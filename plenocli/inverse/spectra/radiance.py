@@ -291,8 +291,8 @@ class _Estimation:
         """
         if self.prior is None:
             return False
-        few = self.c.sample[:: max(1, len(self.c.sample) // 64)]
-        lenslets = _Lenslets(self, few, self.widened.some(few))
+        few = slice(None, None, max(1, len(self.c.sample) // 64))
+        lenslets = _Lenslets(self, self.c.sample[few], self.widened.sampled.some(few))
         sums = lenslets.equations(
             noise=self.noise,
             response_variance=None if self.ratio else self.widened.variance,

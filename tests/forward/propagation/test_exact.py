@@ -769,3 +769,23 @@ def test_errors_of_dim_light_count_no_less_than_it_shows(nearer):
     share = share / share.sum(axis=0)
     shown = np.minimum(1, np.sqrt(share / (share**2).sum(axis=0)))
     assert (builder.lenslets._counted[0] >= 0.9 * shown).all()
+
+
+@pytest.mark.parametrize("nearer", [1.0, 0.95])
+def test_grids_that_are_no_squares_hold_parts_of_a_fine_one(nearer):
+    camera = small_camera()
+    camera = camera.replace(**{"object.distance": nearer * camera.object.distance})
+
+    def matrix(superpixels, asked):
+        plan = accuracy.plan_pif(
+            camera, model="exact", accuracy=asked, superpixels=superpixels, coherent_ring=1
+        )
+        found = PifBuilder(camera, WAVELENGTH, plan, dtype=np.float64).whole()
+        return found.reshape(*superpixels, *found.shape[1:])
+
+    fine = matrix((5, 5), 1e-5)
+    for superpixels in ((3, 1), (1, 3), (5, 3)):
+        rows, columns = (slice(2 - n // 2, 3 + n // 2) for n in superpixels)
+        part = fine[rows, columns]
+        missed = np.sqrt(((matrix(superpixels, 1e-3) - part) ** 2).sum(axis=(0, 1, 2)))
+        assert (missed <= 1e-3 * np.sqrt((part**2).sum(axis=(0, 1, 2)))).all()

@@ -222,11 +222,12 @@ class ExactSquareLenslets(LensletFields):
         """
         # errors of dim light count by their own energy in the end: accuracy for both axes together
         least = (DIM * self.band.cut) ** (0.25 if beside else 0.5)
-        weights = self._counted[axis][s + self._reach(axis)]
+        weights = self._counted[axis][s + len(self._counted[axis]) // 2]
         return np.maximum(weights[: len(self._points(s, axis))], least)
 
     def _sensor_side(self, s: int, axis: int, beside: bool) -> SensorSide:
         """The SensorSide of superpixel s; beside: as _counts."""
+        axis = 0 if self._turn else axis
         if (s, axis, beside) not in self._sensor_sides:
             g = self.geometry
             count, phase, extent = self.band.sensor_count, self._bandwidth, self._extent[axis]
@@ -282,6 +283,8 @@ class ExactSquareLenslets(LensletFields):
         y, x = rows.sum(axis=0), columns.sum(axis=0)
         entering = (y.reshape(len(y), -1) @ x.reshape(len(x), -1).T).real
         counted = [self._counting(rows, x, 0), self._counting(columns, y, 1)]
+        if self._turn:  # one axis serves both, as far as the longer goes
+            counted = [max(counted, key=len)] * 2
         return entering, counted
 
     def _counting(self, gram: np.ndarray, partner: np.ndarray, axis: int) -> np.ndarray:

@@ -74,25 +74,29 @@ def read_described(
     in_file: whether responses, superpixels of white and the dark image stay in the file where they
         are not small.
     """
-    if not in_file:
+    large: set[str] = set()
+    if in_file:
+        with opened_artefact(path, "calibration", {*WHITE_IMAGE, *LARGE}) as (_, seen):
+            large = {name for name in LARGE & seen.keys() if not seen[name].is_small}
+    if not large:  # all values are looked at
         artefact = _read(path, needs, white_image=False)
         return calibration_of(artefact), described_camera(artefact, path)
-    apart = {*WHITE_IMAGE, *LARGE}
-    with opened_artefact(path, "calibration", apart) as (artefact, stored):
-        for name in LARGE & stored.keys():
+    apart = {*WHITE_IMAGE, *large}
+    with opened_artefact(path, "calibration", apart, verify=False) as (artefact, stored):
+        for name in large:
             artefact.data[name] = _in_file(stored[name], "response/polarised" in artefact.data)
     return calibration_of(_sound(artefact, path, needs)), described_camera(artefact, path)
 
 
 def _in_file(values: Stored, told_apart: bool) -> Any:
-    """Values of LARGE, in memory where they are small or one for all lenslets.
+    """Large values of LARGE, in memory where they are one for all lenslets.
 
     told_apart: whether states of polarisation are, by all of a response.
     """
-    if values.name == "dark/mean" and not values.is_small:
+    if values.name == "dark/mean":
         return Plane(values.shape, values.window)
     own = len(values.shape) > 2 and not told_apart
-    return ByLenslet(values) if own and not values.is_small else values.part()
+    return ByLenslet(values) if own else values.part()
 
 
 class ByLenslet:

@@ -335,7 +335,10 @@ def test_layouts_follow_the_memory_limit():
     def plan(superpixels, bands=1):
         size = bands * superpixels * 2704 * 1600 * 4
         return SimpleNamespace(
-            shape=(bands, superpixels, 2704, 1600), bytes=size, memory=size + (64 << 20)
+            shape=(bands, superpixels, 2704, 1600),
+            bytes=size,
+            memory=size + (64 << 20),
+            at_once=1,
         )
 
     with within(Budget(512 << 20)):

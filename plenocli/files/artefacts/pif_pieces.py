@@ -50,7 +50,7 @@ def cost(plan: PifPlan) -> tuple[bool, int]:
     """
     bands, superpixels = plan.shape[:2]
     slab = plan.bytes // (bands * superpixels)
-    work = max(0, plan.memory - plan.bytes) * (plan.at_once if plan.model == "exact" else 1)
+    work = max(0, plan.memory - plan.bytes) * plan.at_once
     streamed = plan.bytes > min(WHOLE_BYTES, budget().memory // 4)
     diagnosed = diagnosis.memory(plan.shape)
     if streamed:  # piece by piece, while the fields are there

@@ -154,9 +154,11 @@ class PifPlan:
 
     @property
     def at_once(self) -> int:
-        """Superpixels that an exact matrix is set up for at the same time: on as many threads as
-        the budget has, where its memory holds the work of each beside the result.
+        """Superpixels that a matrix is set up for at the same time: an exact one's on as many
+        threads as the budget has, where its memory holds the work of each beside the result.
         """
+        if self.model != "exact":
+            return 1
         work, room = max(1, self.memory - self.bytes), budget().memory - 2 * self.bytes
         return max(1, min(budget().threads, self.shape[1], room // work))
 

@@ -36,6 +36,21 @@ ROWS_AT_ONCE = 256
 
 
 @dataclass(frozen=True, kw_only=True)
+class Modes:
+    """Functions that carry a field on a superpixel once the path from the lenslet's middle is taken
+    out of it.
+
+    weighted: (line, node) on the nodes of a SensorSide, roots of the rule's weights in it;
+    pixels: nodes of the pixels, m from the superpixel's centre;
+    shown: (pixels' node, line) on these, roots of their weights in it.
+    """
+
+    weighted: np.ndarray
+    pixels: np.ndarray
+    shown: np.ndarray
+
+
+@dataclass(frozen=True, kw_only=True)
 class SensorSide:
     """How light goes to the superpixel s along one axis, to all lenslets alike.
 
@@ -43,33 +58,26 @@ class SensorSide:
     root: the roots of their weights;
     points: m on the array, that are computed;
     emphasis: their weights in what is left out;
-    modes: (lines, nodes), what the field on the nodes, weighted, is carried by once the path from
-        the lenslet's middle is taken out of it; None: the nodes, which are those of the pixels;
-    pixels: nodes of the pixels, m, where there are modes;
-    shown: (pixels' nodes, lines), the modes there.
+    modes: what carries the field on the nodes; None: the nodes, which are those of the pixels.
     """
 
     u: np.ndarray
     root: np.ndarray
     points: np.ndarray
     emphasis: np.ndarray
-    modes: np.ndarray | None = None
-    pixels: np.ndarray | None = None
-    shown: np.ndarray | None = None
+    modes: Modes | None = None
 
     @property
     def lines(self) -> int:
         """How many numbers carry the field of one point."""
-        return len(self.u if self.modes is None else self.modes)
+        return len(self.u if self.modes is None else self.modes.weighted)
 
     def carry(self, wave: np.ndarray) -> np.ndarray:
         """A kernel (nodes, x), roots of weights folded in, as (lines, x)."""
+        if self.modes is None:
+            return wave
         real = wave.real.dtype
-        return (
-            wave
-            if self.modes is None
-            else (self.modes.astype(real) @ wave.view(real)).view(wave.dtype)
-        )
+        return (self.modes.weighted.astype(real) @ wave.view(real)).view(wave.dtype)
 
 
 class Interval:
@@ -160,13 +168,13 @@ class Interval:
         factor: (lines x points, terms);
         other: as `wave`.
         """
-        side = self.side
-        if side.shown is None or side.pixels is None:
+        modes = self.side.modes
+        if modes is None:
             return factor
-        real, shape = factor.real.dtype, (side.lines, -1)
-        wide = side.shown.astype(real) @ factor.reshape(shape).view(real)
+        real, shape = factor.real.dtype, (self.side.lines, -1)
+        wide = modes.shown.astype(real) @ factor.reshape(shape).view(real)
         wide = wide.view(factor.dtype)
-        apart = self._from_middle(side.pixels, other) - self._own_path(side.pixels)
+        apart = self._from_middle(modes.pixels, other) - self._own_path(modes.pixels)
         if apart.any():
             wide *= np.exp(1j * self.geometry.k * apart).astype(factor.dtype)[:, None]
         return wide.reshape(-1, factor.shape[1])

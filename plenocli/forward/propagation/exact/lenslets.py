@@ -18,7 +18,7 @@ import numpy as np
 from plenocli.base.budget import budget, spread, within
 from plenocli.forward.camera.quadrature import gauss, nodes_for
 from plenocli.forward.propagation.exact.debye import spherical_field
-from plenocli.forward.propagation.exact.interval_pairs import Interval, Pair, SensorSide
+from plenocli.forward.propagation.exact.interval_pairs import Interval, Modes, Pair, SensorSide
 from plenocli.forward.propagation.exact.low_rank_product import Product
 from plenocli.forward.propagation.exact.oblique import at_points, oblique_field
 from plenocli.forward.propagation.exact.prolate import prolate, prolate_count
@@ -66,8 +66,8 @@ DIM, CONCENTRATION, WORST = 4.0, 0.7, 0.5
 """On superpixels beside the own one. Errors of dim light may be as large as what adds so many cuts
 to the light by their own energy. Of what lenslets may lose, of all points together, those that
 count most take more than their share: 1 would leave them none of it, 0 all. No point may lose more
-than so many cuts where terms are left out. (Worst columns of two cameras, 5e-2 to 1e-4, as where
-all points count fully.)
+than so many cuts where terms are left out, by its own light where that is less than the dimmest
+that was tried. (Worst columns of two cameras, 5e-2 to 1e-4, as where all points count fully.)
 """
 
 LEAST = 1e-10
@@ -221,9 +221,19 @@ class ExactSquareLenslets(LensletFields):
         beside: whether the superpixel is not the lenslet's own along the other axis either.
         """
         # errors of dim light count by their own energy in the end: accuracy for both axes together
-        least = (DIM * self.band.cut) ** (0.25 if beside else 0.5)
+        least = (DIM * self.band.cut / self.band.faintest) ** (0.25 if beside else 0.5)
         weights = self._counted[axis][s + len(self._counted[axis]) // 2]
         return np.maximum(weights[: len(self._points(s, axis))], least)
+
+    def _worst(self, sy: int, sx: int) -> np.ndarray | None:
+        """What each point (row, column) may lose on a superpixel beside the own one, root energy of
+        its weighted field; None on the own one.
+        """
+        if not (sy or sx):
+            return None
+        light = self._entering[: len(self._points(sy, 0)), : len(self._points(sx, 1))]
+        # the cut is for the dimmest point that was tried: one between lenslets may have less
+        return WORST * self.band.cut * np.minimum(1, np.sqrt(light) / self.band.faintest)
 
     def _sensor_side(self, s: int, axis: int, beside: bool) -> SensorSide:
         """The SensorSide of superpixel s; beside: as _counts."""
@@ -235,13 +245,16 @@ class ExactSquareLenslets(LensletFields):
                 a.ravel()
                 for a in sensor_nodes(g, axis, self.band.pixel_nodes, s, self.band.pixel_rule)
             )
-            modes = pixels = shown = None
+            modes = None
             if count:
-                pixels, shown = u, np.sqrt(w / extent)[:, None] * prolate(u / extent, phase, count)
                 # functions beyond the bandwidth's own swing faster than it
-                t, w = gauss(nodes_for(2 * phase) + count - int(2 * phase / math.pi))
-                modes = prolate(t, phase, count).T * np.sqrt(w)
-                u, w = extent * t, extent * w
+                t, share = gauss(nodes_for(2 * phase) + count - int(2 * phase / math.pi))
+                modes = Modes(
+                    weighted=prolate(t, phase, count).T * np.sqrt(share),
+                    pixels=u,
+                    shown=np.sqrt(w / extent)[:, None] * prolate(u / extent, phase, count),
+                )
+                u, w = extent * t, extent * share
             points = self._points(s, axis)
             self._sensor_sides[s, axis, beside] = SensorSide(
                 u=u,
@@ -249,8 +262,6 @@ class ExactSquareLenslets(LensletFields):
                 points=points,
                 emphasis=edge_emphasis(g, points) * self._counts(s, axis, beside),
                 modes=modes,
-                pixels=pixels,
-                shown=shown,
             )
         return self._sensor_sides[s, axis, beside]
 
@@ -376,8 +387,7 @@ class ExactSquareLenslets(LensletFields):
         high, wide = product.factors(
             self.band.cut * math.sqrt(count),
             guess,
-            (len(weights[0]), len(weights[1])),
-            WORST * self.band.cut if sy or sx else math.inf,
+            self._worst(sy, sx),
         )
         if alone:
             high, wide = pair.on_pixels(high, wide)

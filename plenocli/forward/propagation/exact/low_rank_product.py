@@ -9,7 +9,6 @@ combinations of both rows and columns show first how many of them it takes, and 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, TypeAlias
 
@@ -131,14 +130,14 @@ class Product:
         return p, triangle.T
 
     def factors(
-        self, cut: float, count: int, points: tuple[int, int] = (1, 1), worst: float = math.inf
+        self, cut: float, count: int, worst: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
         """The product compressed to its own rank, M = H B^T.
 
         cut: root sum of squares that may be lost;
         count: columns of the first sketch;
-        points: of the object along both axes, over which M's rows and columns run fastest;
-        worst: root sum of squares that any one of them may lose.
+        worst: (row, column) root sum of squares that each object point may lose, M's rows and
+            columns running fastest over those along both axes; None: as much as all together.
 
         Returns (H, B).
         Raises NumericsError where no sketch of MAX_SKETCH columns holds M.
@@ -151,7 +150,7 @@ class Product:
             u, s, vh = np.linalg.svd(core)
             root = np.sqrt(s)
             high, wide = q @ (u * root), p @ (vh.T * root)
-            terms = max(terms_within(s, cut), _terms_of_all(high, wide, s, points, worst))
+            terms = max(terms_within(s, cut), _terms_of_all(high, wide, worst))
             u, v = u[:, :terms] * root[:terms], vh[:terms].T * root[:terms]
             if size >= self.limit or (
                 terms <= FILL * size and self._missed(q, u @ v.T, p) <= 2 * cut
@@ -221,20 +220,19 @@ class Product:
         return float(np.sqrt((np.abs(difference) ** 2).mean() * len(x) * len(y)))
 
 
-def _terms_of_all(
-    high: np.ndarray, wide: np.ndarray, s: np.ndarray, points: tuple[int, int], worst: float
-) -> int:
-    """Terms of high wide^T, its columns by falling s, which they hold on either side, that it takes
-    until no point (row, column) loses more than `worst`.
+def _terms_of_all(high: np.ndarray, wide: np.ndarray, worst: np.ndarray | None) -> int:
+    """Terms of high wide^T, its columns by falling singular values, which they hold on either side,
+    that it takes until no point loses more than `worst` (row, column).
     """
-    if worst == math.inf:
+    if worst is None:
         return 1
     # what terms bring to a point: they are orthogonal over all points, and all but so over one
     rows, columns = (
-        (np.abs(x.reshape(-1, n, len(s))) ** 2).sum(axis=0).T for x, n in zip((high, wide), points)
+        (np.abs(x.reshape(-1, n, x.shape[1])) ** 2).sum(axis=0).T
+        for x, n in zip((high, wide), worst.shape)
     )
     lost = np.cumsum((rows[:, :, None] * columns[:, None, :])[::-1], axis=0)[::-1]
-    return max(1, int(np.count_nonzero(lost.max(axis=(1, 2)) > worst**2)))
+    return max(1, int(np.count_nonzero((lost > worst**2).any(axis=(1, 2)))))
 
 
 def _add_product(out: np.ndarray, x: np.ndarray, y: np.ndarray) -> None:

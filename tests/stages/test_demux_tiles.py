@@ -9,7 +9,8 @@ import plenocli.files.artefacts.reading as reading
 import plenocli.forward.sensor.readout as readout
 import plenocli.inverse.spectra.factored as factored
 from plenocli.base.budget import Budget, within
-from plenocli.base.errors import NumericsError
+from plenocli.base.errors import InputError, NumericsError
+from plenocli.base.tiling import InParts
 from plenocli.files.artefacts.container import Artefact
 from plenocli.files.artefacts.provenance import Provenance
 from plenocli.files.artefacts.reading import read_artefact
@@ -149,3 +150,27 @@ def test_what_is_small_beside_the_memory_is_held_and_what_is_not_stays_in_the_fi
             np.testing.assert_array_equal(
                 found.response.matrix[tuple(places)], whole.response.matrix[tuple(places)]
             )
+
+
+def test_a_response_of_no_scale_is_refused_from_its_file_too(files, tmp_path):
+    """Written in parts, of which no rule for whole datasets is asked."""
+    stored = read_artefact(files[0] / "c.h5", "calibration")
+    f = stored.data["response/F"]
+    bands = (1e-35 * f).reshape(-1, *f.shape[-2:])
+    stored.data["response/F"] = InParts(shape=f.shape, dtype=f.dtype, parts=lambda: iter(bands))
+    write_artefact(tmp_path / "c.h5", stored)
+    for memory in (1 << 20, 4 << 30):
+        with within(Budget(memory)), pytest.raises(InputError, match="'response/F' has values up"):
+            found, _ = read_described(tmp_path / "c.h5", needs=("response",), in_file=True)
+            found.response.matrix[np.array([3, 3]), np.array([5, 6])]
+
+
+def test_a_response_to_polarised_light_may_stay_in_its_file(files, tmp_path):
+    stored = read_artefact(files[0] / "c.h5", "calibration")
+    f = stored.data["response/polarised"] = stored.data["response/F"]
+    if f.ndim == 2:
+        pytest.skip("what is one for all lenslets is small beside any memory")
+    write_artefact(tmp_path / "c.h5", stored)
+    with within(Budget(16 * f.nbytes // 2)):
+        found, _ = read_described(tmp_path / "c.h5", needs=("response",), in_file=True)
+    np.testing.assert_array_equal(found.response.matrix, f)

@@ -4,7 +4,7 @@ datasets of one.
 
 import re
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ import numpy as np
 from plenocli.files.artefacts.schema import Attr, Field, Schema
 
 
-def _lit_lenslets(data: Mapping[str, np.ndarray]) -> str | None:
+def _lit_lenslets(data: Mapping[str, np.ndarray], there: Collection[str]) -> str | None:
     valid = data["grid/valid"].astype(bool)
     if not valid.any():
         return "no lenslet of 'grid/valid' is lit"
@@ -22,7 +22,7 @@ def _lit_lenslets(data: Mapping[str, np.ndarray]) -> str | None:
     return None
 
 
-def _whole_response(data: Mapping[str, np.ndarray]) -> str | None:
+def _whole_response(data: Mapping[str, np.ndarray], there: Collection[str]) -> str | None:
     for name, needed in (
         ("response/F", "response/wavelength"),
         ("response/F", "response/window"),
@@ -30,17 +30,24 @@ def _whole_response(data: Mapping[str, np.ndarray]) -> str | None:
         ("response/origin", "response/window"),
         ("response/polarised", "response/F"),
     ):
-        if name in data and needed not in data:
+        if name in there and needed not in there:
             return f"'{name}' lacks '{needed}'"
     if "response/F" in data:
-        known = np.abs(data["response/F"][np.isfinite(data["response/F"])])
-        largest = float(known.max()) if known.size else np.inf
-        if largest and not 1e-30 <= largest <= 1e30:  # radiances are single precision
-            return f"'response/F' has no value that counts, or values up to {largest:.3g}"
+        known = np.isfinite(data["response/F"])
+        if not known.any():
+            return "'response/F' has no value that counts"
+        return scale_problem(np.abs(data["response/F"][known]).max())
     return None
 
 
-def _one_entry_each(data: Mapping[str, np.ndarray]) -> str | None:
+def scale_problem(largest: float) -> str | None:
+    """What is wrong with a response whose largest value (without a sign) this is."""
+    if largest and not 1e-30 <= largest <= 1e30:  # radiances are single precision
+        return f"'response/F' has values up to {largest:.3g}, which are of no scale"
+    return None
+
+
+def _one_entry_each(data: Mapping[str, np.ndarray], there: Collection[str]) -> str | None:
     offset = data["stack/lenslet_offset"]
     if np.abs(offset.astype(float)).max() > 1e4:
         return "'stack/lenslet_offset' lies beyond any array"
@@ -50,7 +57,7 @@ def _one_entry_each(data: Mapping[str, np.ndarray]) -> str | None:
     )
 
 
-def _even_history(data: Mapping[str, np.ndarray]) -> str | None:
+def _even_history(data: Mapping[str, np.ndarray], there: Collection[str]) -> str | None:
     kept = {v.shape for path, v in data.items() if path.startswith("dictionary/state/history_")}
     even = len(kept) <= 1 and all(len(shape) == 1 for shape in kept)
     return None if even else "'dictionary/state' has histories of several lengths"

@@ -38,6 +38,7 @@ from plenocli.files.artefacts.structure import (
     attribute_names,
     no_hdf5,
     read_attribute,
+    stays,
     survey,
     window,
 )
@@ -84,7 +85,7 @@ def read_edited(path: str | os.PathLike) -> tuple[Artefact, str]:
             "is no artefact with a digest block", path, "edit it with a library that keeps it"
         )
     with _opened(path) as descriptor:
-        return _held(path, descriptor, None, ())[0], header[1].decode()
+        return _held(path, descriptor, None, {})[0], header[1].decode()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,11 +103,6 @@ class Stored:
     shape: tuple[int, ...]
     dtype: np.dtype
     schema: tables.Schema
-
-    @property
-    def is_small(self) -> bool:
-        """Whether all of it is less than a SHARE of the memory: then it may as well be held."""
-        return math.prod(self.shape) * self.dtype.itemsize <= budget().memory // SHARE
 
     def window(self, rows: slice = EVERYTHING, columns: slice = EVERYTHING) -> np.ndarray:
         """Part of the last two axes; errors as `part`."""
@@ -139,6 +135,7 @@ def opened_artefact(
     kind: str | tuple[str, ...] | None,
     apart: Collection[str],
     *,
+    large: Collection[str] = (),
     verify: bool = True,
 ) -> Iterator[tuple[Artefact, Mapping[str, Stored]]]:
     """As read_artefact, but for large datasets whose values are read bit by bit; these may be read
@@ -146,6 +143,7 @@ def opened_artefact(
 
     path, kind: as of read_artefact.
     apart: the datasets that stay in the file, whose bytes are verified before.
+    large: others that stay there, if they take more than a SHARE of the memory.
     verify: whether the digest is looked at; not where this run has done so before.
 
     Yields (the Artefact without them, those of them that there are). Raises as read_artefact.
@@ -156,8 +154,13 @@ def opened_artefact(
         digest = _require_whole(path, os.pread(descriptor, HEADER_BYTES, 0), size)
         if verify and _digest_behind(descriptor) != digest:
             raise _damaged(path)
-        found = _held(path, descriptor, kind, apart)
+        found = _held(path, descriptor, kind, _staying(apart, large))
     yield found
+
+
+def _staying(apart: Collection[str], large: Collection[str] = ()) -> dict[str, int]:
+    """`apart` of `stays` for datasets as opened_artefact has them."""
+    return dict.fromkeys(large, budget().memory // SHARE) | dict.fromkeys(apart, -1)
 
 
 @contextlib.contextmanager
@@ -172,11 +175,11 @@ def _opened(path: Path) -> Iterator[int]:
 
 
 def _held(
-    path: Path, descriptor: int, kind: str | tuple[str, ...] | None, apart: Collection[str]
+    path: Path, descriptor: int, kind: str | tuple[str, ...] | None, apart: dict[str, int]
 ) -> tuple[Artefact, dict[str, Stored]]:
-    """What the HDF5 part of an open file holds, as opened_artefact yields it."""
+    """What the HDF5 part of an open file holds, as opened_artefact yields it; apart: of `stays`."""
     seconds = _LOOK_S + path.stat().st_size // _SLOWEST
-    values = outside(compressed_values, path, sorted(apart), seconds=seconds)
+    values = outside(compressed_values, path, apart, seconds=seconds)
     with h5py.File(Behind(descriptor, HEADER_BYTES), "r") as file:
         artefact = _parse(path, file, kind, apart, values)
         found = {
@@ -187,7 +190,7 @@ def _held(
                 dtype=file[name].dtype,
                 schema=SCHEMAS[artefact.kind],
             )
-            for name in apart
+            for name in apart.keys() - artefact.data.keys()
             if name in file
         }
     return artefact, found
@@ -247,24 +250,24 @@ def _require_whole(path: Path, head: bytes, size: int) -> str:
     return header[1].decode()
 
 
-def compressed_values(path: str, skip: list[str]) -> dict[str, np.ndarray]:
+def compressed_values(path: str, apart: dict[str, int]) -> dict[str, np.ndarray]:
     """Dataset path -> values of those that are stored in pieces, which a damaged index of pieces
     may lead HDF5 astray in; runs outside. An empty dict where what the file declares breaks its
     table, as `_parse` then says: what no table knows may be of any size.
 
-    skip: datasets that are not wanted.
+    apart: of `stays`.
 
     Raises as survey; InputError and MemoryError for what HDF5 cannot read.
     """
     with _as_input_error(Path(path)), h5py.File(path, "r", locking=False) as file:
-        declared = survey(path, file, skip)
+        declared = survey(path, file, apart)
         kind = None
         if "plenocli_kind" in attribute_names(file):
             kind = read_attribute(path, file, "plenocli_kind")
         schema = SCHEMAS.get(kind) if isinstance(kind, str) else None
         if schema is None or tables.declared_problems(schema, declared):
             return {}
-        wanted = [name for name in declared if name not in skip]
+        wanted = [name for name in declared if not stays(name, declared[name], apart)]
         return {name: file[name][()] for name in wanted if file[name].chunks is not None}
 
 
@@ -272,11 +275,11 @@ def _parse(
     path: Path,
     file: h5py.File,
     kind: str | tuple[str, ...] | None,
-    skip: Collection[str],
+    apart: dict[str, int],
     compressed: dict[str, np.ndarray],
 ) -> Artefact:
     """What an open file holds; `compressed`: the values that were read outside."""
-    declared = survey(path, file, skip)
+    declared = survey(path, file, apart)
     root = {
         name: read_attribute(path, file, name)
         for name in tables.ROOT_ATTRIBUTES
@@ -294,13 +297,13 @@ def _parse(
         data = {
             name: compressed[name] if file[name].chunks is not None else file[name][()]
             for name in declared
-            if name not in skip
+            if not stays(name, declared[name], apart)
         }
         data = {
             name: values if isinstance(values, np.ndarray) else np.asarray(values)
             for name, values in data.items()
         }
-        problems = tables.value_problems(schema, data)
+        problems = tables.value_problems(schema, data, declared)
     if problems:
         raise InputError(
             "breaks the table of its kind: " + "; ".join(problems),

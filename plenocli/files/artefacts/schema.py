@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -97,7 +97,8 @@ class Schema:
     attrs: group or dataset path -> its attributes; all may be left out.
     plots: group -> (signal dataset, names of its companions).
     default: the groups to draw first.
-    rules: what must hold between datasets; each says what is wrong of (path -> array), or None.
+    rules: what must hold between datasets; each says what is wrong of (path -> array) and the paths
+        that there are, or None.
     """
 
     kind: str
@@ -107,7 +108,7 @@ class Schema:
     attrs: dict[str, tuple[Attr, ...]] = field(default_factory=dict)
     plots: dict[str, tuple[str, tuple[str, ...]]] = field(default_factory=dict)
     default: tuple[str, ...] = ()
-    rules: tuple[Callable[[Mapping[str, np.ndarray]], str | None], ...] = ()
+    rules: tuple[Callable[[Mapping[str, np.ndarray], Collection[str]], str | None], ...] = ()
 
     def field_for(self, path: str) -> Field | None:
         """The Field that describes dataset `path`, or None."""
@@ -195,9 +196,13 @@ def _known(schema: Schema) -> str:
     return ", ".join(entry.path for entry in schema.fields)
 
 
-def value_problems(schema: Schema, data: Mapping[str, np.ndarray]) -> list[str]:
+def value_problems(
+    schema: Schema, data: Mapping[str, np.ndarray], others: Collection[str] = ()
+) -> list[str]:
     """Every way in which the values of `data` (path -> array) break the table: NaN, infinities,
     below minimum, beyond FURTHEST, order, and what must hold between datasets.
+
+    others: paths of datasets that there are, too, whose values are not at hand.
     """
     problems = []
     for path, values in data.items():
@@ -219,7 +224,7 @@ def value_problems(schema: Schema, data: Mapping[str, np.ndarray]) -> list[str]:
             problems.append(f"dataset '{path}' goes down to {low:.6g}, below {entry.minimum:g}")
         if entry.ascending and values.size > 1 and not (np.diff(values) > 0).all():
             problems.append(f"dataset '{path}' does not ascend")
-    return problems + [said for rule in schema.rules if (said := rule(data))]
+    return problems + [said for rule in schema.rules if (said := rule(data, {*data, *others}))]
 
 
 def attribute_problems(schema: Schema, attrs: Mapping[str, Mapping[str, Any]]) -> list[str]:

@@ -4,8 +4,9 @@ the rest declares.
 
 from __future__ import annotations
 
+import math
 import os
-from collections.abc import Collection
+from collections.abc import Mapping
 from typing import Any, TypeAlias
 
 import h5py
@@ -17,6 +18,7 @@ from plenocli.base.errors import InputError
 from plenocli.base.memory import can_have
 
 Name: TypeAlias = str | os.PathLike[str]
+Values: TypeAlias = tuple[tuple[int, ...], np.dtype]
 _FIX = (
     "make it with plenocli; files from elsewhere may hold plain numbers, and text of fixed length "
     "(numpy.bytes_), only"
@@ -33,17 +35,17 @@ _MAX_DEPTH = 8
 
 
 def survey(
-    path: Name, file: h5py.File, apart: Collection[str] = ()
-) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
+    path: Name, file: h5py.File, apart: Mapping[str, int] | None = None
+) -> dict[str, Values]:
     """Walk `file` (an open h5py.File) and return dataset path -> (shape, dtype).
 
     Refuses, with InputError naming `path` and the object: soft, external and user-defined links, an
     object linked twice, external or virtual storage, unknown filters, any type but plain integers,
     floats, true/false and fixed-length text, and what does not fit the
-    memory of this process, as Budget.require_declared, but for the datasets `apart`. Reads no
-    dataset.
+    memory of this process, as Budget.require_declared, but for the datasets that stay `apart` in
+    their file. Reads no dataset.
     """
-    declared: dict[str, tuple[tuple[int, ...], np.dtype]] = {}
+    declared: dict[str, Values] = {}
     seen: set[int] = set()
     total = 0
     stack = [
@@ -72,13 +74,23 @@ def survey(
                 if _is_empty_axis(dataset):
                     continue
                 declared[child] = shape, dtype
-                if child in apart:
-                    continue
-                total += int(np.prod([int(n) for n in shape], dtype=object)) * dtype.itemsize
+                if not stays(child, declared[child], apart or {}):
+                    total += _bytes_of(declared[child])
             else:
                 raise InputError(f"'/{child}' is neither a group nor a dataset", path, _FIX)
             budget().require_declared(path, total, total, f" up to '/{child}'")
     return dict(sorted(declared.items()))
+
+
+def _bytes_of(declared: Values) -> int:
+    """What a dataset's values take."""
+    shape, dtype = declared
+    return math.prod(int(n) for n in shape) * dtype.itemsize
+
+
+def stays(name: str, declared: Values, apart: Mapping[str, int]) -> bool:
+    """Whether a dataset stays in its file; apart: more bytes than which keep one there."""
+    return name in apart and _bytes_of(declared) > apart[name]
 
 
 def window(path: str, name: str, part: list[int]) -> dict[str, np.ndarray]:

@@ -142,7 +142,7 @@ def _checked(artefact, streamed):
     )
     problems = tables.declared_problems(schema, declared) + tables.attribute_problems(schema, attrs)
     known = {path: v for path, v in data.items() if not isinstance(v, InParts)}
-    problems += tables.value_problems(schema, known)
+    problems += tables.value_problems(schema, known, declared)
     groups = {
         path.rsplit("/", depth)[0] for path in declared for depth in range(1, path.count("/") + 1)
     }

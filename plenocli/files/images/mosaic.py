@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from plenocli.files.artefacts.reading import Stored
 
 CAPTURE = "plenocli:capture"  # EXR attribute: JSON of what a capture artefact has as attributes
+MOSAIC = "capture/mosaic"
 FURTHEST = 1e100
 """Of the largest value of a capture from 1, in either direction."""
 _CFA = re.compile(r"mono|[RGB]{4}")
@@ -131,13 +132,22 @@ def capture_in_file(path: str | Path, *, cfa: str | None = None) -> Capture:
     """As read_capture, but that the mosaic of an artefact stays in its file, a Plane, where it is
     not small.
     """
-    with stored_capture(path) as stored:
-        if stored is None or stored.mosaic.is_small:
-            return read_capture(path, cfa=cfa)
+    from plenocli.files.artefacts.reading import opened_artefact
+
+    path = Path(path)
+    if not is_hdf5(path):
+        return read_capture(path, cfa=cfa)
+    with opened_artefact(path, "capture", ("capture/scene",), large=(MOSAIC,)) as (found, stored):
+        mosaic: Any = found.data.get(MOSAIC)
+        if mosaic is None:
+            whole = _stored(path, found, stored[MOSAIC])
+            mosaic = Plane(whole.shape, lambda rows, columns: whole.window(rows, columns).mosaic)
+        else:
+            _require_sound(path, mosaic)
+        capture = _capture_of(path, found, mosaic)
         if cfa is not None:
-            _require_array(path, stored.about, cfa)
-        mosaic: Any = Plane(stored.shape, lambda rows, columns: stored.window(rows, columns).mosaic)
-        return replace(stored.about, mosaic=mosaic)
+            _require_array(path, capture, cfa)
+        return capture
 
 
 @contextlib.contextmanager
@@ -152,11 +162,13 @@ def stored_capture(path: str | Path, *, verify: bool = True) -> Iterator[StoredC
     if not is_hdf5(path):
         yield None
         return
-    apart = ("capture/mosaic", "capture/scene")
+    apart = (MOSAIC, "capture/scene")
     with opened_artefact(path, "capture", apart, verify=verify) as (artefact, stored):
-        mosaic = stored["capture/mosaic"]
-        blank = np.empty((0, 0), mosaic.dtype)
-        yield StoredCapture(_capture_of(path, artefact, blank), mosaic)
+        yield _stored(path, artefact, stored[MOSAIC])
+
+
+def _stored(path: Path, artefact: Artefact, mosaic: Stored) -> StoredCapture:
+    return StoredCapture(_capture_of(path, artefact, np.empty((0, 0), mosaic.dtype)), mosaic)
 
 
 def is_hdf5(path: str | Path) -> bool:
@@ -174,7 +186,7 @@ def _from_artefact(path: Path) -> Capture:
     from plenocli.files.artefacts.reading import read_artefact
 
     artefact = read_artefact(path, "capture")
-    return _capture_of(path, artefact, artefact.data["capture/mosaic"])
+    return _capture_of(path, artefact, artefact.data[MOSAIC])
 
 
 def _capture_of(path: Path, artefact: Artefact, mosaic: np.ndarray) -> Capture:

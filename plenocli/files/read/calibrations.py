@@ -11,6 +11,7 @@ import numpy as np
 from plenocli.base.errors import InputError
 from plenocli.base.tiling import Plane
 from plenocli.files.artefacts.container import Artefact
+from plenocli.files.artefacts.kinds import scale_problem
 from plenocli.files.artefacts.provenance import Provenance
 from plenocli.files.artefacts.reading import Stored, opened_artefact, read_artefact
 from plenocli.files.artefacts.writing import write_artefact
@@ -74,16 +75,9 @@ def read_described(
     in_file: whether responses, superpixels of white and the dark image stay in the file where they
         are not small.
     """
-    large: set[str] = set()
-    if in_file:
-        with opened_artefact(path, "calibration", {*WHITE_IMAGE, *LARGE}) as (_, seen):
-            large = {name for name in LARGE & seen.keys() if not seen[name].is_small}
-    if not large:  # all values are looked at
-        artefact = _read(path, needs, white_image=False)
-        return calibration_of(artefact), described_camera(artefact, path)
-    apart = {*WHITE_IMAGE, *large}
-    with opened_artefact(path, "calibration", apart, verify=False) as (artefact, stored):
-        for name in large:
+    large = LARGE if in_file else ()
+    with opened_artefact(path, "calibration", WHITE_IMAGE, large=large) as (artefact, stored):
+        for name in stored.keys() & LARGE:
             artefact.data[name] = _in_file(stored[name], "response/polarised" in artefact.data)
     return calibration_of(_sound(artefact, path, needs)), described_camera(artefact, path)
 
@@ -96,7 +90,17 @@ def _in_file(values: Stored, told_apart: bool) -> Any:
     if values.name == "dark/mean":
         return Plane(values.shape, values.window)
     own = len(values.shape) > 2 and not told_apart
-    return ByLenslet(values) if own else values.part()
+    return ByLenslet(values) if own else _of_scale(values, values.part())
+
+
+def _of_scale(stored: Stored, values: np.ndarray) -> np.ndarray:
+    """Some values of a dataset of LARGE; InputError where they are responses of no scale."""
+    if stored.name == "response/F":
+        known = np.isfinite(values)
+        ends = values.max(initial=0, where=known), -values.min(initial=0, where=known)
+        if wrong := scale_problem(float(max(ends))):
+            raise InputError(wrong, stored.path, "calibrate again")
+    return values
 
 
 class ByLenslet:
@@ -113,7 +117,7 @@ class ByLenslet:
             sides = [slice(int(p[here].min()), int(p[here].max()) + 1) for p in places]
             near = (place[here] - side.start for place, side in zip(places, sides))
             out[here] = self.stored.part(*sides)[tuple(near)]
-        return out
+        return _of_scale(self.stored, out)
 
 
 def _read(path: str | Path, needs: tuple[str, ...], white_image: bool) -> Artefact:

@@ -151,7 +151,8 @@ def disc_rows(radius: float, slope: float) -> Rows:
     slope: rad/m that the integrand's phase changes by at most in any direction.
     """
     phase = slope * radius
-    count = int(np.ceil(phase / 2 + 3 * np.cbrt(phase) + 5))
+    # phases that bend, as of aberrations, have a longer tail than waves aslant
+    count = int(np.ceil(phase / 2 + 4 * np.cbrt(phase) + 8))
     theta = (np.arange(count) + 0.5) * np.pi / count - np.pi / 2
     half = radius * np.cos(theta)
     t, w = gauss(nodes_for(phase))

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from functools import lru_cache, partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
@@ -30,6 +30,10 @@ if TYPE_CHECKING:
     from plenocli.forward.camera.geometry import Geometry
     from plenocli.forward.camera.model import Camera
 
+Tries: TypeAlias = Callable[
+    ["Camera", "Geometry", tuple[int, int], int | None, bool], TrialColumns | None
+]
+"""What tries columns: trial_columns or the like."""
 FRINGES = ((0.65, 1.0), (4.0, 2.0), (0.1, 2.0), (0.03, 2.0))
 """Weight a N^-b of the fringes between lenslets 1, 2, ... apart in a column, N their cells."""
 LAW = 0.5
@@ -181,6 +185,7 @@ def size_band(
     accuracy: float,
     tolerance: float,
     dim: bool = False,
+    tries: Tries = trial_columns,
 ) -> BandPlan:
     """As Model.size, of the paraxial models; the phase across a lenslet counts the far edge of the
     outermost superpixel that it lights.
@@ -190,7 +195,8 @@ def size_band(
     accuracy: that sampling may use up;
     tolerance: root-energy cut of the spread function;
     dim: whether superpixels beside the object's own may have fewer nodes, where so little light
-        falls on them that it does not tell.
+        falls on them that it does not tell;
+    tries: how columns are tried.
 
     Raises NumericsError as psf_nodes.
     """
@@ -216,10 +222,10 @@ def size_band(
             # a point at a corner lights two of them
             errors.append(math.sqrt(2) * pixel_error(*fewer, *light, BESIDE))
     else:
-        trial = trial_columns(camera, geometry, superpixels, window, is_symmetric(camera))
+        trial = tries(camera, geometry, superpixels, window, is_symmetric(camera))
         alone = None
         if trial is None and window is not None:
-            alone = trial_columns(camera, geometry, superpixels, None, is_symmetric(camera))
+            alone = tries(camera, geometry, superpixels, None, is_symmetric(camera))
         tried = trial or alone
         faintest = UNTRIED if tried is None else tried.faintest
         # a point between lenslets is dim, and what is missed weighs more in its column

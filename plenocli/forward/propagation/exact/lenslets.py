@@ -29,6 +29,7 @@ from plenocli.forward.propagation.exact.term_counts import (
     require_sketch,
     sketch_size,
 )
+from plenocli.forward.propagation.exact.trial import exact_trial_columns
 from plenocli.forward.propagation.fresnel.array_to_sensor import lit_lenslets, sensor_nodes
 from plenocli.forward.propagation.fresnel.separable_fields import Factors
 from plenocli.forward.propagation.fresnel.spread_function import (
@@ -89,7 +90,15 @@ def exact_band(
     # a corner's column is on four superpixels, each with errors of its own: measured up to 1.16 of
     # what was asked from 3e-3 to 5e-2, on 3 cameras
     finer = 1 + SIDES * min(1.0, max(0.0, math.log10(accuracy / 1e-3))) if ring else 1.0
-    base = size_band(camera, geometry, superpixels, ring, accuracy / finer, tolerance)
+    base = size_band(
+        camera,
+        geometry,
+        superpixels,
+        ring,
+        accuracy / finer,
+        tolerance,
+        tries=exact_trial_columns,
+    )
     # light out of focus is spread over many superpixels, each of which is cut by itself; coarse
     # cuts hurt corners more
     share = min(1.0, 4 / math.pi * (geometry.D2 / max(geometry.blur, geometry.D2)) ** 2)

@@ -1,10 +1,5 @@
-"""Sensor fields behind lenslets of any shape, anywhere on the array and with their neighbours, by
-the exact scalar kernel: with opening weights W on nodes of the rectangle around a lenslet and the
-kernel as a short sum of products (residual.Residual), the field of a point is
-
-    U(v, u) = sum over lenslets and terms r of [P_r(v, y_i)] [W_ij L_ij h_ij] [Q_r(u, x_j)]^T.
-
-docs/model.md, "Exact propagation".
+"""Matrices of lenslets of any shape, anywhere on the array and with their neighbours, by the exact
+scalar kernel on whole openings: open_fields. docs/model.md, "Exact propagation".
 """
 
 from __future__ import annotations
@@ -12,21 +7,28 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
-from functools import lru_cache
-from itertools import product
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from plenocli.base.errors import NumericsError
-from plenocli.forward.camera.quadrature import gauss, nodes_for, opening_weights
+from plenocli.forward.camera.quadrature import nodes_for
 from plenocli.forward.propagation.costs import Features
 from plenocli.forward.propagation.exact.cost_law import OBLIQUE_TERMS, columns, field_seconds
-from plenocli.forward.propagation.exact.debye import spherical_field
-from plenocli.forward.propagation.exact.oblique import at_points, oblique_field, orders_for
-from plenocli.forward.propagation.exact.residual import Residual, path
+from plenocli.forward.propagation.exact.oblique import orders_for
+from plenocli.forward.propagation.exact.open_fields import (
+    OpenFields,
+    Opening,
+    Place,
+    lenslets_about,
+    offset_of,
+    opening_nodes,
+    residual_of,
+    seen_from,
+)
+from plenocli.forward.propagation.exact.residual import Residual
+from plenocli.forward.propagation.exact.trial import exact_trial_columns
 from plenocli.forward.propagation.fresnel.array_to_sensor import pixel_energy, sensor_nodes
-from plenocli.forward.propagation.fresnel.spread_function import separable_field
 from plenocli.forward.propagation.lenslet_fields import FieldNotes, LensletFields, PixelEnergies
 from plenocli.forward.propagation.plan import BandPlan
 from plenocli.forward.propagation.sampling import (
@@ -40,8 +42,6 @@ if TYPE_CHECKING:
     from plenocli.forward.camera.model import Camera
     from plenocli.forward.propagation.plan import PifPlan
 
-Place = tuple[float, float]
-"""(row, column), in pitches where it is said."""
 NEAREST = 10
 """Wavelengths from lenslets to sensor within which evanescent waves reach it."""
 MOST_PAIRS = 4000
@@ -92,10 +92,12 @@ def opening_band(
 
     Raises NumericsError as size_band, and for more than MOST_PAIRS.
     """
-    base = size_band(camera, geometry, superpixels, ring, accuracy, tolerance)
+    base = size_band(
+        camera, geometry, superpixels, ring, accuracy, tolerance, tries=exact_trial_columns
+    )
     count = math.prod(superpixels)
     if base.window is not None:
-        count *= len(_lenslets(geometry, superpixels, base.window))
+        count *= len(lenslets_about(geometry, superpixels, base.window))
     if count > MOST_PAIRS:
         raise NumericsError(
             f"{count} pairs of a lenslet and a superpixel are too many to sum over openings",
@@ -112,7 +114,7 @@ def opening_band(
     return OpeningBand(
         **vars(base)
         | {
-            "lenslet_nodes": max(_count(geometry, parabolic, *pair) for pair in pairs),
+            "lenslet_nodes": max(opening_nodes(geometry, parabolic, *pair) for pair in pairs),
             "sampling": math.hypot(base.sampling, moved, own.lost / dim),
         },
         kernel_cut=cut,
@@ -129,28 +131,28 @@ class OpenLenslets(LensletFields):
         self, camera: Camera, geometry: Geometry, plan: PifPlan, band: OpeningBand
     ) -> None:
         self.geometry, self.superpixels, self.band = geometry, plan.superpixels, band
-        self.dtype = np.dtype(np.complex128 if plan.double else np.complex64)
-        self._parabolic = camera.lenslet_array.profile == "parabolic"
-        self._field = (
-            separable_field(camera, geometry, band.half, band.spread_cut, spherical_field)
-            if geometry.chief == (0.0, 0.0)
-            else oblique_field(camera, geometry, band.half, band.spread_cut)
+        self._fields = OpenFields(
+            camera,
+            geometry,
+            band.half,
+            (band.spread_cut, band.kernel_cut),
+            band.window,
+            np.dtype(np.complex128 if plan.double else np.complex64),
         )
-        self.symmetry = self._field.symmetry
+        field = self._fields.field
+        self.symmetry = field.symmetry
         self.notes = FieldNotes(
-            separable_terms=band.kernel_terms,
-            field_tail=self._field.tail,
-            psf_terms=self._field.terms,
+            separable_terms=band.kernel_terms, field_tail=field.tail, psf_terms=field.terms
         )
 
     def incident(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
         """As LensletFields.incident."""
         g, total = self.geometry, np.zeros(len(rows))
         count = nodes_for(4 * g.k * g.D1 / 2 / g.z2 * max(g.lenslet_extent))
-        for lenslet in _lenslets(g, self.superpixels, self.band.window):
-            opening = _Opening(g, self._parabolic, lenslet, count)
+        for lenslet in lenslets_about(g, self.superpixels, self.band.window):
+            opening = Opening(g, self._fields.parabolic, lenslet, count)
             weight = opening.weights * opening.nearer**2
-            for some, fields in self._entering(opening, rows, columns):
+            for some, fields in self._fields.entering(opening, rows, columns):
                 power = np.square(fields.real) + np.square(fields.imag)
                 total[some] += np.tensordot(power, weight, 2)
         return total * (1 + self.band.sampling)
@@ -170,124 +172,13 @@ class OpenLenslets(LensletFields):
             order = np.argsort(columns, kind="stable")
             for start in range(0, len(order), step):
                 part = order[start : start + step]
-                total = np.zeros((len(part), *shape), self.dtype)
-                for lenslet in _seen_from(self.geometry, place, self.band.window):
-                    self._add(place, lenslet, nodes, rows[part], columns[part], total)
+                lines = [(v.ravel(), w.ravel()) for v, w in nodes]
+                total = self._fields.on(place, lines, rows[part], columns[part])
                 out[part] = pixel_energy(
                     total.reshape(len(part), *nodes[0][0].shape, *nodes[1][0].shape)
                 )
 
         return energies
-
-    def _add(
-        self,
-        place: Place,
-        lenslet: Place,
-        nodes: list[tuple[np.ndarray, np.ndarray]],
-        rows: np.ndarray,
-        columns: np.ndarray,
-        total: np.ndarray,
-    ) -> None:
-        """Add a lenslet's field on the nodes of a superpixel: total (point, row, column)."""
-        g, offset = self.geometry, _offset(self.geometry, place, lenslet)
-        opening = _Opening(g, self._parabolic, lenslet, _count(g, self._parabolic, offset, lenslet))
-        residual = _residual(g, offset, self.band.kernel_cut)
-        down, across = (
-            self._kernel(residual, opening, axis, offset, *(a.ravel() for a in nodes[axis]))
-            for axis in (0, 1)
-        )
-        # terms side by side, the kernel's weights in the first of the two
-        down = np.ascontiguousarray(np.einsum("rvy,rs->vsy", down, residual.core.astype(complex)))
-        down = down.astype(self.dtype).reshape(-1, len(opening.y))
-        across = across.transpose(0, 2, 1).astype(self.dtype).reshape(-1, across.shape[1])
-        lens = opening.wave().astype(self.dtype)
-        for some, fields in self._entering(opening, rows, columns):
-            for point, field in zip(some, fields):
-                behind = down @ (field * lens)
-                total[point] += behind.reshape(total.shape[1], -1) @ across
-
-    def _kernel(
-        self,
-        residual: Residual,
-        opening: _Opening,
-        axis: int,
-        offset: Place,
-        u: np.ndarray,
-        weight: np.ndarray,
-    ) -> np.ndarray:
-        """The kernel along an axis, roots of the sensor's weights in it: (term, node, place)."""
-        g, x = self.geometry, (opening.y, opening.x)[axis]
-        way = path(offset[axis] + u[:, None] - x, g.z3, offset[axis], offset[1 - axis])
-        wave = np.sqrt(weight / (g.wavelength * g.z3))[:, None] * np.exp(1j * g.k * way)
-        return residual.functions(axis, u, x) * wave
-
-    def _entering(
-        self, opening: _Opening, rows: np.ndarray, columns: np.ndarray
-    ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Fields of points on the nodes of an opening, without weights and the chief ray's sphere.
-
-        Yields (which points, (point, row, column)) column by column of the points.
-        """
-        lines, values = (rows, columns), []
-        for axis, at in enumerate(opening.places):
-            points = self.geometry.points(axis)
-            used = np.unique(lines[axis])
-            found = self._field.evaluate(at - points[used][:, None], axis)
-            found = at_points(self._field, found, points[used][:, None])
-            kind = self.dtype if np.iscomplexobj(found) else np.empty(0, self.dtype).real.dtype
-            values.append(found.astype(kind))
-        row = np.searchsorted(np.unique(rows), rows)
-        for number, column in enumerate(np.unique(columns)):
-            some = np.flatnonzero(columns == column)
-            yield some, values[0][row[some]] @ values[1][number].T
-
-
-class _Opening:
-    """Nodes of the rectangle around a lenslet's opening.
-
-    y, x: m from its centre;
-    places: m from the object's own lenslet;
-    weights: (row, column) m^2;
-    nearer: (row, column) how much stronger the main lens's wave is than at the object's own
-        lenslet.
-    """
-
-    def __init__(self, geometry: Geometry, parabolic: bool, lenslet: Place, count: int) -> None:
-        g, t = geometry, gauss(count)[0]
-        self._geometry, self._parabolic = g, parabolic
-        self.y, self.x = (extent * t for extent in g.lenslet_extent)
-        self.places = tuple(a * g.D2 + at for a, at in zip(lenslet, (self.y, self.x)))
-        self.weights = math.prod(g.lenslet_extent) * opening_weights(g.lenslet_shape, count)
-        self._aside = g.chief != (0.0, 0.0)
-        y, x = (c + at for c, at in zip(g.chief, self.places))
-        self._far2 = g.z2**2 + y[:, None] ** 2 + x**2
-        self.nearer = np.ones(self.weights.shape)
-        if self._aside:
-            self.nearer = (g.z2**2 + g.chief[0] ** 2 + g.chief[1] ** 2) / self._far2
-
-    def wave(self) -> np.ndarray:
-        """Lens, chief ray's sphere and weights: (row, column) m^2."""
-        g = self._geometry
-        q = self.y[:, None] ** 2 + self.x**2
-        lens = q / (2 * g.f2) if self._parabolic else q / (np.hypot(np.sqrt(q), g.f2) + g.f2)
-        if self._aside:
-            middle = g.z2**2 + g.chief[0] ** 2 + g.chief[1] ** 2
-            come = (self._far2 - middle) / (np.sqrt(self._far2) + math.sqrt(middle))
-        else:
-            come = (self.places[0][:, None] ** 2 + self.places[1] ** 2) / (2 * g.z2)
-        return self.weights * self.nearer * np.exp(1j * g.k * (come - lens))
-
-
-def _lenslets(geometry: Geometry, superpixels: tuple[int, int], window: int | None) -> list[Place]:
-    """Where lenslets stand whose light is followed, in pitches."""
-    if window is None:
-        return list(geometry.places(superpixels))
-    return [p for lenslets in geometry.neighbourhood(window) for p in product(*lenslets)]
-
-
-def _seen_from(geometry: Geometry, place: Place, window: int | None) -> list[Place]:
-    """The lenslets that light the superpixel at `place`."""
-    return [place] if window is None else _lenslets(geometry, (1, 1), window)
 
 
 def _pairs(
@@ -295,8 +186,8 @@ def _pairs(
 ) -> Iterator[tuple[Place, tuple[Place, Place]]]:
     """(superpixel, (offset from the lenslet, lenslet)) of all pairs."""
     for place in geometry.places(superpixels):
-        for lenslet in _seen_from(geometry, place, window):
-            yield place, (_offset(geometry, place, lenslet), lenslet)
+        for lenslet in seen_from(geometry, place, window):
+            yield place, (offset_of(geometry, place, lenslet), lenslet)
 
 
 def _nearest_and_farthest(
@@ -305,54 +196,8 @@ def _nearest_and_farthest(
     """Residuals of a lenslet's own superpixel and of the pair (offset, lenslet) farthest apart."""
     far = max(math.hypot(*offset) for offset, _ in pairs)
     farthest = min(offset for offset, _ in pairs if math.hypot(*offset) >= far)
-    own = _offset(geometry, (0.0, 0.0), (0.0, 0.0))
-    return _residual(geometry, own, cut), _residual(geometry, farthest, cut)
-
-
-def _offset(geometry: Geometry, place: Place, lenslet: Place) -> Place:
-    """From a lenslet to the centre of the superpixel at `place` (both in pitches): (rows, columns)
-    m.
-    """
-    g = geometry
-    y, x = (
-        s * g.superpixel_pitch - m * g.D2 + c * g.z3 / g.z2
-        for s, m, c in zip(place, lenslet, g.chief)
-    )
-    return y, x
-
-
-def _reach(geometry: Geometry, axis: int) -> float:
-    """Half width (m) of a superpixel's window, wherever the raster puts it."""
-    pixels = geometry.pixel_shape[axis] + (geometry.pixel_shift is not None)
-    return pixels * geometry.pixel_pitch / 2
-
-
-@lru_cache(maxsize=512)
-def _residual(geometry: Geometry, offset: Place, cut: float) -> Residual:
-    """What the kernel's two axes do together, from a lenslet to a superpixel."""
-    g = geometry
-    reach = max(_reach(g, 0), _reach(g, 1))
-    return Residual(offset, reach, max(g.lenslet_extent), g.z3, g.k, None, cut)
-
-
-@lru_cache(maxsize=4096)
-def _count(geometry: Geometry, parabolic: bool, offset: Place, lenslet: Place) -> int:
-    """Nodes per axis that integrate what is summed over a square opening, or that carry it to the
-    weights of another.
-    """
-    g, most = geometry, 0.0
-    y, x = (extent * np.linspace(-1, 1, 5) for extent in g.lenslet_extent)
-    v, u = (o + _reach(g, n) * np.linspace(-1, 1, 5) for n, o in enumerate(offset))
-    y, x = y[:, None, None, None], x[:, None, None]
-    come = [c + m * g.D2 + at for c, m, at in zip(g.chief, lenslet, (y, x))]
-    goes = v[:, None] - y, u - x
-    far = np.sqrt(g.z2**2 + come[0] ** 2 + come[1] ** 2) if g.chief != (0.0, 0.0) else g.z2
-    on = np.sqrt(g.z3**2 + goes[0] ** 2 + goes[1] ** 2)
-    bend = g.f2 if parabolic else np.sqrt(g.f2**2 + y * y + x * x)
-    for axis, at in enumerate((y, x)):
-        slope = np.abs(come[axis] / far - at / bend - goes[axis] / on).max()
-        most = max(most, g.lenslet_extent[axis] * (slope + g.D1 / (2 * g.z2)))
-    return nodes_for((1 if g.lenslet_shape == "square" else 2) * g.k * most)
+    own = offset_of(geometry, (0.0, 0.0), (0.0, 0.0))
+    return residual_of(geometry, own, cut), residual_of(geometry, farthest, cut)
 
 
 def features(
@@ -365,7 +210,7 @@ def features(
     lit = columns(camera, g, shape) / shape[1]
     tall, wide = (n * band.pixel_nodes for n in g.pixel_shape)
     all_pairs = [pair for _, pair in _pairs(g, superpixels, band.window)]
-    nodes = np.array([_count(g, parabolic, *pair) for pair in all_pairs])
+    nodes = np.array([opening_nodes(g, parabolic, *pair) for pair in all_pairs])
     # the kernel's products are fewer for lenslets that are near
     r = (len(_nearest_and_farthest(g, all_pairs, band.kernel_cut)[0].core) + band.kernel_terms) / 2
     made = 1.0  # share of superpixels that symmetry does not give

@@ -10,6 +10,7 @@ everything, without separable terms.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import product
@@ -96,16 +97,28 @@ def trial_columns(
     window: int | None,
     symmetric: bool,
 ) -> TrialColumns | None:
-    """The TrialColumns of a camera, None where they would take too long.
+    """The TrialColumns of a camera by the paraxial model, None where they would take too long.
 
     camera: at the wavelength of `geometry`;
     grid: (rows, columns) of superpixels kept;
     window: coherent lenslets on either side, None for isolated ones;
     symmetric: whether pupil and wavefront are mirrored by both axes.
     """
+    return tried_by(Trial, camera, geometry, grid, window, symmetric)
+
+
+def tried_by(
+    kind: Callable[..., Trial],
+    camera: Camera,
+    geometry: Geometry,
+    grid: tuple[int, int],
+    window: int | None,
+    symmetric: bool,
+) -> TrialColumns | None:
+    """As trial_columns, by another kind of trial."""
     if window is not None:
         window = min(window, math.ceil(geometry.blur / (2 * geometry.D2)) + NEAR)
-    return _tried(_Hashed(camera), geometry, grid, window, symmetric)
+    return _tried(kind, _Hashed(camera), geometry, grid, window, symmetric)
 
 
 def cut_field(
@@ -149,12 +162,17 @@ def _cut(hashed: _Hashed, geometry: Geometry, half: float, tolerance: float) -> 
 
 @lru_cache(maxsize=KEPT)
 def _tried(
-    hashed: _Hashed, geometry: Geometry, grid: tuple[int, int], window: int | None, symmetric: bool
+    kind: Callable[..., Trial],
+    hashed: _Hashed,
+    geometry: Geometry,
+    grid: tuple[int, int],
+    window: int | None,
+    symmetric: bool,
 ) -> TrialColumns | None:
     # fewer pixels, superpixels and lenslets where that is too much
     lenslets = [None] if window is None else range(window, 0, -1)
     for near, beside, lines in product(lenslets, (1, 0), (None, *THINNED)):
-        trial = _Trial(geometry, grid, near, symmetric, beside, lines)
+        trial = kind(geometry, grid, near, symmetric, beside, lines)
         points = trial.points[: max(int(CHEAP / trial.cost), min(int(AFFORDED / trial.cost), FEW))]
         if points and trial.values <= VALUES:
             light, fringes, within = trial.columns(hashed.camera, points)
@@ -182,8 +200,8 @@ def _pixel_lines(geometry: Geometry, count: int, most: int | None) -> tuple[list
     return lines.tolist(), most / lit
 
 
-class _Trial:
-    """Nodes on lenslets and pixels of one trial."""
+class Trial:
+    """Nodes on lenslets and pixels of one trial, and fields there by the paraxial model."""
 
     def __init__(
         self,
@@ -198,7 +216,7 @@ class _Trial:
         `lines` of pixels on each, None for all.
         """
         g = geometry
-        self.geometry = g
+        self.geometry, self.window, self.half = g, window, g.field_half(grid, window)
         seen = math.ceil(g.blur / (2 * g.D2)) + beside + 0.01
         # the points that symmetry leaves light superpixels on their own side
         other = 0.51 if symmetric and g.blur == 0 else seen
@@ -262,40 +280,57 @@ class _Trial:
         self, camera: Camera, points: list[tuple[int, int]]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(light, fringes, light_within) of points, as TrialColumns has them."""
-        g, m = self.geometry, self.degrees
-        at = [(g.points(0)[i], g.points(1)[j]) for i, j in points]
-        light, norm, gram = np.zeros(len(at)), np.zeros(len(at)), np.zeros((len(at), m, m))
-        within: list[list[np.ndarray]] = [[] for _ in at[: self.looked_into]]
-        entered = None
-        kernels: dict[tuple, np.ndarray] = {}
+        m, count = self.degrees, len(points)
+        light, norm, gram = np.zeros(count), np.zeros(count), np.zeros((count, m, m))
+        within: list[list[np.ndarray]] = [[] for _ in points[: self.looked_into]]
         # from the light at a pixel's nodes, weights included, to Legendre coefficients over half of
         # the pixel
         onto = legendre(gauss(m)[0], m, 1).T * (np.arange(m) + 0.5)[:, None]
+        for n, field in self.fields(camera, points):
+            energy = (field.real**2 + field.imag**2).reshape(
+                len(self.pixels[0]), m, len(self.pixels[1]), m
+            )
+            series = onto @ energy.sum(axis=3).transpose(1, 0, 2).reshape(m, -1)
+            series += onto @ energy.sum(axis=1).transpose(2, 0, 1).reshape(m, -1)
+            gram[n] += series @ series.T
+            norm[n] += float((energy.sum(axis=(1, 3)) ** 2).sum())
+            light[n] += float(energy.sum()) / math.prod(self.sampled)
+            if n < len(within):
+                series = onto @ energy.transpose(0, 2, 1, 3) @ onto.T
+                within[n].append(series.reshape(-1, m, m).astype(np.float32))
+        scale = np.sqrt(norm[: len(within), None, None, None]).astype(np.float32)
+        return light, gram / norm[:, None, None], np.stack([*map(np.concatenate, within)]) / scale
+
+    def fields(
+        self, camera: Camera, points: list[tuple[int, int]]
+    ) -> Iterator[tuple[int, np.ndarray]]:
+        """Fields of points (row, column) at the nodes of pixels, weights included.
+
+        Yields superpixel by superpixel, for each point (which, (row, column)).
+        """
+        g, entered, kernels = self.geometry, None, dict[tuple, np.ndarray]()
+        at = [(g.points(0)[i], g.points(1)[j]) for i, j in points]
         for place in self.places:
             products = self.products or [(np.array([place[0]]), np.array([place[1]]))]
             if entered is None or self.products is None:
                 entered = [self._entering(camera, lenslets, at) for lenslets in products]
+            ways = [
+                [self._kernel(kernels, axis, lenslets[axis], place[axis]) for axis in (0, 1)]
+                for lenslets in products
+            ]
             for n in range(len(at)):
-                field: np.ndarray | int = 0
-                for lenslets, fields in zip(products, entered):
-                    down, across = (
-                        self._kernel(kernels, axis, lenslets[axis], place[axis]) for axis in (0, 1)
-                    )
-                    field = field + down @ fields[n] @ across.T
-                field = np.asarray(field)
-                energy = (field.real**2 + field.imag**2).reshape(
-                    len(self.pixels[0]), m, len(self.pixels[1]), m
-                )
-                series = onto @ energy.sum(axis=3).transpose(1, 0, 2).reshape(m, -1)
-                series += onto @ energy.sum(axis=1).transpose(2, 0, 1).reshape(m, -1)
-                gram[n] += series @ series.T
-                norm[n] += float((energy.sum(axis=(1, 3)) ** 2).sum())
-                light[n] += float(energy.sum()) / math.prod(self.sampled)
-                if n < len(within):
-                    series = onto @ energy.transpose(0, 2, 1, 3) @ onto.T
-                    within[n].append(series.reshape(-1, m, m).astype(np.float32))
-        scale = np.sqrt(norm[: len(within), None, None, None]).astype(np.float32)
-        return light, gram / norm[:, None, None], np.stack([*map(np.concatenate, within)]) / scale
+                parts = [down @ each[n] @ across.T for (down, across), each in zip(ways, entered)]
+                yield n, np.sum(parts, axis=0)
+
+    def nodes(self, axis: int, place: float) -> tuple[np.ndarray, np.ndarray]:
+        """(positions, m from the centre of the superpixel at `place`; weights, m) along an axis,
+        pixel by pixel.
+        """
+        v, w = (
+            a.T[self.pixels[axis]].ravel()
+            for a in sensor_nodes(self.geometry, axis, self.degrees, place)
+        )
+        return v, w
 
     def _entering(
         self, camera: Camera, lenslets: tuple, points: list[tuple[float, float]]
@@ -333,9 +368,7 @@ class _Trial:
         key = axis, place, *positions
         if key not in kept:
             g = self.geometry
-            v, wv = (
-                a.T[self.pixels[axis]].ravel() for a in sensor_nodes(g, axis, self.degrees, place)
-            )
+            v, wv = self.nodes(axis, place)
             x = g.lenslet_extent[axis] * gauss(self.count)[0]
             kernels = [lenslet_kernel(g, n - place, v, wv, x) for n in positions]
             if g.lenslet_shape == "square":

@@ -11,8 +11,8 @@ import numpy as np
 
 from plenocli.base.errors import NumericsError
 from plenocli.forward.camera.quadrature import nodes_for
+from plenocli.forward.propagation.exact.trial import exact_trial_columns
 from plenocli.forward.propagation.fresnel.paraxial_error import paraxial_error
-from plenocli.forward.propagation.fresnel.trial_columns import trial_columns
 from plenocli.forward.propagation.harmonics.bessel import bessel_tail
 from plenocli.forward.propagation.harmonics.interpolation import tap_error
 from plenocli.forward.propagation.plan import BandPlan
@@ -90,7 +90,7 @@ def harmonic_band(
     g = geometry
     own = 2 * rim(g) * g.pixel_active / (g.wavelength * g.z3)
 
-    tried = trial_columns(camera, g, superpixels, None, is_symmetric(camera))
+    tried = exact_trial_columns(camera, g, superpixels, None, is_symmetric(camera))
     root = 1.0 if tried is None else dimness(tried.faintest)
     # measured: 0.25 to 2.4 times tap_error; a blurred point lights a patch of the superpixel, and a
     # dim one has the finest fringes alone

@@ -1,0 +1,81 @@
+"""Columns of a few points by the exact model, as plenocli.forward.propagation.fresnel.trial_columns
+has them by the paraxial one: what little light points between lenslets have is another one where
+lenses are fast, and so are its fringes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from plenocli.forward.propagation.exact.open_fields import OpenFields, offset_of, residual_of
+from plenocli.forward.propagation.fresnel.trial_columns import (
+    VALUES,
+    Trial,
+    TrialColumns,
+    trial_columns,
+    tried_by,
+)
+
+if TYPE_CHECKING:
+    from plenocli.forward.camera.geometry import Geometry
+    from plenocli.forward.camera.model import Camera
+
+CUTS = 1e-8, 1e-7
+"""What is left out of fields: of the spread function, and of the kernel."""
+
+
+class ExactTrial(Trial):
+    """A Trial by the exact model, of lenslets on the axis."""
+
+    @property
+    def cost(self) -> float:
+        """As of Trial: each term of the kernel is twice as much as the paraxial model."""
+        g = replace(self.geometry, chief=(0.0, 0.0))
+        return 2 * super().cost * len(residual_of(g, offset_of(g, (0, 0), (0, 0)), CUTS[1]).core)
+
+    def fields(
+        self, camera: Camera, points: list[tuple[int, int]]
+    ) -> Iterator[tuple[int, np.ndarray]]:
+        """As of Trial."""
+        g = replace(self.geometry, chief=(0.0, 0.0))
+        behind = OpenFields(camera, g, self.half, CUTS, self.window, np.dtype(complex))
+        rows, columns = np.array(points).T
+        for place in self.places:
+            nodes = [self.nodes(axis, at) for axis, at in enumerate(place)]
+            step = max(1, VALUES // math.prod(len(v) for v, _ in nodes))
+            for start in range(0, len(points), step):
+                some = slice(start, start + step)
+                yield from enumerate(behind.on(place, nodes, rows[some], columns[some]), start)
+
+
+def exact_trial_columns(
+    camera: Camera,
+    geometry: Geometry,
+    grid: tuple[int, int],
+    window: int | None,
+    symmetric: bool,
+) -> TrialColumns | None:
+    """As trial_columns, by the exact model where that is quick; where neighbours join, whose exact
+    kernels never are, what both the paraxial model of all and the exact one of each alone ask for.
+    """
+    alone = tried_by(ExactTrial, camera, geometry, grid, None, symmetric)
+    if window is None and alone:
+        return alone
+    paraxial = trial_columns(camera, geometry, grid, window, symmetric)
+    return _Both(**vars(paraxial), alone=alone) if paraxial and alone else paraxial
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Both(TrialColumns):
+    """Columns with the light of neighbours, beside those of lenslets `alone`."""
+
+    alone: TrialColumns
+
+    def error(self, count: int, rule: int) -> float:
+        """As of TrialColumns, the larger of both."""
+        return max(super().error(count, rule), self.alone.error(count, rule))

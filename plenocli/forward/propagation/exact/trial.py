@@ -60,22 +60,22 @@ def exact_trial_columns(
     window: int | None,
     symmetric: bool,
 ) -> TrialColumns | None:
-    """As trial_columns, by the exact model where that is quick; where neighbours join, whose exact
-    kernels never are, what both the paraxial model of all and the exact one of each alone ask for.
+    """As trial_columns, by the exact model where it tries all columns in time; else what both the
+    paraxial model of more of them, and of neighbours that join, and the exact one ask for.
     """
-    alone = tried_by(ExactTrial, camera, geometry, grid, None, symmetric)
-    if window is None and alone:
-        return alone
+    exact = tried_by(ExactTrial, camera, geometry, grid, None, symmetric)
+    if window is None and exact and exact.whole:
+        return exact
     paraxial = trial_columns(camera, geometry, grid, window, symmetric)
-    return _Both(**vars(paraxial), alone=alone) if paraxial and alone else paraxial
+    return _Both(**vars(paraxial), exact=exact) if paraxial and exact else paraxial
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Both(TrialColumns):
-    """Columns with the light of neighbours, beside those of lenslets `alone`."""
+    """Columns by the paraxial model, beside some by the exact one of isolated lenslets."""
 
-    alone: TrialColumns
+    exact: TrialColumns
 
     def error(self, count: int, rule: int) -> float:
         """As of TrialColumns, the larger of both."""
-        return max(super().error(count, rule), self.alone.error(count, rule))
+        return max(super().error(count, rule), self.exact.error(count, rule))

@@ -21,6 +21,7 @@ from plenocli.forward.propagation.exact.debye import spherical_field
 from plenocli.forward.propagation.exact.interval_pairs import Interval, Modes, Pair, SensorSide
 from plenocli.forward.propagation.exact.low_rank_product import Product
 from plenocli.forward.propagation.exact.oblique import at_points, oblique_field
+from plenocli.forward.propagation.exact.open_fields import too_near
 from plenocli.forward.propagation.exact.prolate import prolate, prolate_count
 from plenocli.forward.propagation.exact.term_counts import (
     ExactBand,
@@ -139,12 +140,7 @@ def valid_for(camera: Camera, geometry: Geometry) -> str | None:
     array = camera.lenslet_array
     if array.lattice != "square" or array.aperture_shape != "square":
         return f"{array.aperture_shape} lenslets on a {array.lattice} lattice are not separable"
-    if geometry.z3 < 10 * geometry.wavelength:
-        return (
-            "the sensor lies within ten wavelengths of the lenslets, where "
-            "evanescent waves reach it"
-        )
-    return None
+    return too_near(geometry)
 
 
 class ExactSquareLenslets(LensletFields):

@@ -33,6 +33,21 @@ Nodes = tuple[np.ndarray, np.ndarray]
 """(positions, m from a superpixel's centre; weights, m)."""
 
 
+NEAREST = 10
+"""Wavelengths from lenslets to sensor within which evanescent waves reach it."""
+
+
+def too_near(geometry: Geometry) -> str | None:
+    """Why the exact kernel does not serve a sensor that close; None where it does."""
+    away = geometry.z3 / geometry.wavelength
+    if away >= NEAREST:
+        return None
+    return (
+        f"the sensor lies {away:.2g} wavelengths behind the lenslets, and within {NEAREST} "
+        "evanescent waves reach it"
+    )
+
+
 class OpenFields:
     """Fields of points behind lenslets of any shape.
 

@@ -25,6 +25,7 @@ from plenocli.forward.propagation.exact.open_fields import (
     opening_nodes,
     residual_of,
     seen_from,
+    too_near,
 )
 from plenocli.forward.propagation.exact.residual import Residual
 from plenocli.forward.propagation.exact.trial import exact_trial_columns
@@ -42,8 +43,6 @@ if TYPE_CHECKING:
     from plenocli.forward.camera.model import Camera
     from plenocli.forward.propagation.plan import PifPlan
 
-NEAREST = 10
-"""Wavelengths from lenslets to sensor within which evanescent waves reach it."""
 MOST_PAIRS = 4000
 """Pairs of a lenslet and a superpixel beyond which a sum over openings is no plan."""
 KERNEL_CUT = 0.1
@@ -75,9 +74,7 @@ def valid_for(camera: Camera, geometry: Geometry) -> str | None:
     shape, lattice = camera.lenslet_array.aperture_shape, camera.lenslet_array.lattice
     if (shape, lattice, geometry.chief) == ("square", "square", (0.0, 0.0)):
         return "square lenslets on the axis are left to separable terms"
-    if geometry.z3 < NEAREST * geometry.wavelength:
-        return "the sensor lies within ten wavelengths of the lenslets"
-    return None
+    return too_near(geometry)
 
 
 def opening_band(

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from plenocli.forward.propagation.exact.debye import radial_waves
+from plenocli.forward.propagation.exact.open_fields import too_near
 from plenocli.forward.propagation.fresnel.paraxial_error import paraxial_error
 from plenocli.forward.propagation.fresnel.radial import is_radial
 from plenocli.forward.propagation.harmonics.bessel import bessel_orders
@@ -25,9 +26,6 @@ if TYPE_CHECKING:
     from plenocli.forward.propagation.harmonics.sizing import HarmonicBand
     from plenocli.forward.propagation.plan import PifPlan
 
-NEAREST = 10
-"""Wavelengths from lenslets to sensor within which evanescent waves reach it."""
-
 
 def valid_for(camera: Camera, geometry: Geometry) -> str | None:
     """As Model.valid_for: lenslets behind a pupil that is the same in all directions."""
@@ -39,11 +37,9 @@ def valid_for(camera: Camera, geometry: Geometry) -> str | None:
             "the pupil is not the same in all directions, as harmonics need it; "
             f"the paraxial model is off by about {paraxial_error(geometry, False):.2g}"
         )
-    if geometry.z3 < NEAREST * geometry.wavelength:
-        return "the sensor lies within ten wavelengths of the lenslets"
     if geometry.chief != (0.0, 0.0):
         return "a lenslet off the axis sees an oblique cone, which this rung does not follow"
-    return None
+    return too_near(geometry)
 
 
 class CentredLenslets(LensletFields):

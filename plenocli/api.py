@@ -52,7 +52,7 @@ from plenocli.inverse.fit.camera_fit import CameraFit
 from plenocli.inverse.fit.captures import believed_model, captured_lenslets
 from plenocli.inverse.fit.fit import fit_camera as fit_to_captures
 from plenocli.inverse.fit.optics import parameters_without
-from plenocli.inverse.lightfield.gather import samples_of
+from plenocli.inverse.lightfield.gather import bands_of
 from plenocli.inverse.lightfield.light_field import refocused, usual_slopes
 from plenocli.inverse.lightfield.optics import Optics
 from plenocli.inverse.lightfield.planes import LightField
@@ -537,8 +537,8 @@ def refocus(
         raise UsageError("distances need the camera's description", fix="give camera")
     wanted = [*slopes, *(optics.slope(d) for d in distances if optics is not None)]
     planes = np.array(sorted(set(wanted))) if wanted else usual_slopes()
-    samples, shape = samples_of(_capture(capture), calibration, planes=len(planes))
-    return refocused(samples, shape, planes, views=views, optics=optics, grow=not wanted)
+    source = bands_of(_capture(capture), calibration)
+    return refocused(source, planes, views=views, optics=optics, grow=not wanted)
 
 
 def score(

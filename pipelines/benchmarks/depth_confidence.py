@@ -17,7 +17,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 
 from plenocli.inverse.lightfield import depth as module
 from plenocli.inverse.lightfield.planes import distance_of
-from plenocli.inverse.lightfield.samples import collect
+from plenocli.inverse.lightfield.samples import SampleBands, collect
 
 FOCAL, IMAGE, GAP, PITCH, COUNT = 0.05, 0.055, 0.5e-3, 55e-6, 28
 FITTED = ("camera", "coins", "page", "moon", "brick", "grass")
@@ -73,7 +73,9 @@ def judged(scenes):
     """(confidence, error, error over sigma, whether one thing hides another) of known lenslets."""
     found, inner = [], (slice(2, -2), slice(2, -2))
     for number, (samples, true) in enumerate(scenes):
-        depth, _ = module.depth_in_reach(samples, np.linspace(-3, 3, 13).tolist(), true.shape)
+        depth, _ = module.depth_in_reach(
+            SampleBands.of(samples, true.shape), np.linspace(-3, 3, 13).tolist()
+        )
         error = np.abs(depth.slope - true)[inner]
         known = np.isfinite(error)
         two = np.full(known.sum(), number % 2 == 1)

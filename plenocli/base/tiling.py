@@ -6,13 +6,16 @@ memory.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from typing import Any
+from itertools import islice
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+T = TypeVar("T")
 BAND, LEAST = 1 << 18, 16
 """Points of a band of a Plane, about, and its rows at least."""
 
@@ -145,6 +148,47 @@ def bands(count: int, most: int) -> list[slice]:
     """Rows 0 to `count` in bands of `most` (at least one), the last of what is left."""
     most = max(1, most)
     return [slice(start, min(start + most, count)) for start in range(0, count, most)]
+
+
+def windows(blocks: Iterable[np.ndarray], wanted: Iterable[slice]) -> Iterator[np.ndarray]:
+    """Rows of what comes in blocks of rows, (..., row, column), each block after the one before.
+
+    blocks: asked for as they are needed; no more rows are held than that takes.
+    wanted: rows, of which neither end goes back and none is left out between two.
+    """
+    coming, held, top = iter(blocks), None, 0
+    for rows in wanted:
+        parts: list[np.ndarray] = [] if held is None else [held[..., max(rows.start - top, 0) :, :]]
+        top = rows.start if held is not None else top
+        while top + sum(part.shape[-2] for part in parts) < rows.stop:
+            parts.append(next(coming))
+        held = parts[0] if len(parts) == 1 else np.concatenate(parts, axis=-2)
+        yield held[..., rows.start - top : rows.stop - top, :]
+
+
+def shared(items: Iterable[T], count: int) -> list[Iterator[T]]:
+    """The same items for each of `count` who ask for them in turn. As itertools.tee, which keeps
+    dozens that nobody waits for any more; here only those are held that some have not had.
+    """
+    coming, waiting = iter(items), [deque[T]() for _ in range(count)]
+
+    def own(mine: deque[T]) -> Iterator[T]:
+        while True:
+            if not mine:
+                item = list(islice(coming, 1))
+                for other in waiting:
+                    other.extend(item)
+                if not item:
+                    return
+                item.clear()
+            yield mine.popleft()
+
+    return [own(mine) for mine in waiting]
+
+
+def widened(rows: slice, reach: int, count: int) -> slice:
+    """Rows and `reach` more on either side, as far as there are `count` of them."""
+    return slice(max(rows.start - reach, 0), min(rows.stop + reach, count))
 
 
 def mirrored(rows: slice, reach: int, count: int) -> np.ndarray:

@@ -1,10 +1,22 @@
 """The tiling of a plane by lenslets."""
 
+import weakref
+
 import numpy as np
 import pytest
 
 from plenocli.base import tiling
-from plenocli.base.tiling import InParts, Plane, bands, mirrored, to_blocks, to_plane
+from plenocli.base.tiling import (
+    InParts,
+    Plane,
+    bands,
+    mirrored,
+    shared,
+    to_blocks,
+    to_plane,
+    widened,
+    windows,
+)
 
 
 def test_blocks_are_what_stands_in_the_plane_and_go_back():
@@ -57,3 +69,31 @@ def test_bands_of_a_plane_cover_it_and_are_never_thin(monkeypatch, shape, multip
     assert min(rows.stop - rows.start for rows in found) >= min(tiling.LEAST, multiple)
     doubled = plane.through(lambda part: 2 * part)
     assert (doubled.window(slice(3, 9), slice(1, 4)) == 2 * values[..., 3:9, 1:4]).all()
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_windows_of_blocks_are_rows_of_the_whole_and_shared_ones_are_let_go(seed):
+    rng = np.random.default_rng(seed)
+    whole = rng.normal(size=(2, 40, 3))
+    ends = np.sort(rng.choice(np.arange(1, 40), 6, replace=False))
+    alive = []
+
+    def blocks():
+        for block in np.split(whole, ends, axis=1):
+            made = block.copy()
+            alive.append(weakref.ref(made))
+            yield made
+
+    own = bands(40, 4)
+    several = [
+        zip(own, windows(part, [widened(rows, reach, 40) for rows in own]))
+        for reach, part in zip((0, 2, 5), shared(blocks(), 3))
+    ]
+    for each in zip(*several):
+        for reach, (rows, found) in zip((0, 2, 5), each):
+            around = slice(max(rows.start - reach, 0), min(rows.stop + reach, 40))
+            np.testing.assert_array_equal(found, whole[:, around])
+        # what lies behind is let go while the rest is worked on
+        passed = int(np.searchsorted(ends, rows.start - 9, "right"))
+        assert not any(one() is not None for one in alive[:passed])
+    assert len(alive) == len(ends) + 1

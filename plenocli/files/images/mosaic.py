@@ -128,16 +128,19 @@ class StoredCapture:
         return replace(self.about, mosaic=values, levels=self.about.levels.from_pixel(*first))
 
 
-def capture_in_file(path: str | Path, *, cfa: str | None = None) -> Capture:
+def capture_in_file(path: str | Path, *, cfa: str | None = None, small: bool = True) -> Capture:
     """As read_capture, but that the mosaic of an artefact stays in its file, a Plane, where it is
     not small.
+
+    small: whether one that is small beside the memory is held.
     """
     from plenocli.files.artefacts.reading import opened_artefact
 
     path = Path(path)
     if not is_hdf5(path):
         return read_capture(path, cfa=cfa)
-    with opened_artefact(path, "capture", ("capture/scene",), large=(MOSAIC,)) as (found, stored):
+    apart = ("capture/scene",) if small else ("capture/scene", MOSAIC)
+    with opened_artefact(path, "capture", apart, large=(MOSAIC,)) as (found, stored):
         mosaic: Any = found.data.get(MOSAIC)
         if mosaic is None:
             whole = _stored(path, found, stored[MOSAIC])

@@ -42,6 +42,8 @@ PARTS = {
 """Datasets that a file must have to hold a part."""
 WHITE_IMAGE = ("white/flat", "white/level")
 """The white image, which is large and which those do not need who have its superpixels."""
+IMAGES = {"white/flat", "dark/mean"}
+"""Datasets with a value for every pixel of the sensor."""
 LARGE = {"response/F", "response/white", "dark/mean"}
 """Datasets that may stay in the file."""
 
@@ -63,6 +65,20 @@ def read_calibration(
     Raises InputError where the file cannot be read or lacks what is needed.
     """
     return calibration_of(_read(path, needs, white_image), response=response)
+
+
+def read_images(path: str | Path) -> Calibration:
+    """A Calibration with its lenslets, and the white and the dark image, which stay in the file;
+    without responses and superpixels.
+
+    Raises InputError where the file cannot be read.
+    """
+    unread = [f"response/{name}" for name in ("F", "covariance", "white", "polarised", "energy")]
+    with opened_artefact(path, "calibration", [*IMAGES, *unread]) as (artefact, stored):
+        for name in stored.keys() & IMAGES:
+            image: Any = Plane(stored[name].shape, stored[name].window)
+            artefact.data[name] = image
+    return calibration_of(artefact, response=False)
 
 
 def read_described(

@@ -8,7 +8,7 @@ import numpy as np
 
 from plenocli.inverse.lightfield.planes import Colours, DepthMap, LightField
 from plenocli.inverse.lightfield.refocus import STEP
-from plenocli.inverse.lightfield.samples import Channels, Samples
+from plenocli.inverse.lightfield.samples import Channels, SampleBands
 
 if TYPE_CHECKING:
     from plenocli.files.artefacts.container import Artefact
@@ -17,13 +17,13 @@ if TYPE_CHECKING:
 
 
 def lightfield_artefact(
-    field: LightField, samples: Samples, provenance: "Provenance"
+    field: LightField, source: SampleBands, provenance: "Provenance"
 ) -> "Artefact":
-    """The artefact of a light field; `samples`: what it was made from."""
+    """The artefact of a light field; `source`: what it was made from."""
     from plenocli.files.artefacts.container import Artefact
 
     data = {
-        "refocus/value": field.pictures.astype(np.float32, copy=False),
+        "refocus/value": field.pictures,
         "refocus/slope": field.slopes,
         "refocus/sharpness": field.sharpness,
         "refocus/distance": field.distances,
@@ -38,16 +38,16 @@ def lightfield_artefact(
             "depth/distance_sigma": field.depth.distance_sigma,
         }
     if field.sharp is not None:
-        data |= {"depth/picture": field.sharp.astype(np.float32)}
+        data |= {"depth/picture": field.sharp}
     if field.views is not None:
-        data |= {"views/value": field.views.astype(np.float32)}
+        data |= {"views/value": field.views}
     if field.colours is not None:
         data |= _colours(field.colours)
     attrs: dict[str, dict] = {
         "refocus": {
-            "pitch": samples.pitch,
+            "pitch": source.pitch,
             "step": STEP,
-            "pupil": 2 * samples.reach(),
+            "pupil": 2 * source.survey.reach,
             "spacing": field.spacing,
             "microscope": field.microscope or None,
         }
@@ -61,18 +61,19 @@ SUFFIXES = (".h5", ".tif", ".tiff", ".exr")
 
 
 def write_lightfield(
-    path: Path, field: LightField, samples: Samples, provenance: "Provenance", *, overwrite: bool
+    path: Path, field: LightField, source: SampleBands, provenance: "Provenance", *, overwrite: bool
 ) -> None:
     """Write a light field as its artefact (.h5), as an OME-TIFF, or as an EXR, by the suffix.
 
-    samples: what it was made from.
+    field: its pictures may be InParts where it becomes an artefact.
+    source: what it was made from.
 
     Raises UsageError, OutputError.
     """
     if path.suffix == ".h5":
         from plenocli.files.artefacts.writing import write_artefact
 
-        write_artefact(path, lightfield_artefact(field, samples, provenance), overwrite=overwrite)
+        write_artefact(path, lightfield_artefact(field, source, provenance), overwrite=overwrite)
     elif path.suffix == ".exr":
         _write_exr(path, field, provenance, overwrite)
     else:
@@ -163,15 +164,15 @@ def _colours(colours: Colours) -> dict[str, Any]:
     """The datasets of colours."""
     channels = colours.channels
     data = {
-        "colour/value": colours.pictures.astype(np.float32, copy=False),
+        "colour/value": colours.pictures,
         "colour/to_rgb": channels.to_rgb,
         "colour/weight": channels.weights,
         "colour/wavelength": channels.wavelengths,
     }
     if colours.sharp is not None:
-        data["colour/picture"] = colours.sharp.astype(np.float32)
+        data["colour/picture"] = colours.sharp
     if colours.views is not None:
-        data["colour/views"] = colours.views.astype(np.float32)
+        data["colour/views"] = colours.views
     return data
 
 

@@ -1,13 +1,17 @@
 """A map of depths from one capture: the slope at which the views of a point agree best."""
 
-from collections.abc import Sequence
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 import numpy as np
 
-from plenocli.base.tiling import bands
+from plenocli.base.budget import budget
+from plenocli.base.tiling import bands, shared, widened, windows
 from plenocli.inverse.lightfield.planes import DepthMap
-from plenocli.inverse.lightfield.refocus import STEP, in_colour, place, refocus
-from plenocli.inverse.lightfield.samples import AT_ONCE, Samples
+from plenocli.inverse.lightfield.refocus import STEP, Parts, displacement, pictures, place
+from plenocli.inverse.lightfield.samples import AT_ONCE, SampleBands
 
 ROUNDS = 4
 """Corrections of a depth map by least squares."""
@@ -31,16 +35,18 @@ MOST = 12.0
 """Slope to which a range grows at most: a point's light is then spread over a hundred lenslets."""
 GROWTH = 4
 """Planes by which a range grows at a time."""
+TOGETHER, SHARE, SUMS_BYTES = (16 << 20, 64 << 20), 32, 72
+"""Bytes that planes which are worked on together take, about, at least and at most: a SHARE of the
+memory; and those for each point of the rows that one holds (measured). The fewer at a time, the
+more often pixels are read; pictures are the same.
+"""
 
 
-def depth(
-    samples: Samples, slopes: Sequence[float], shape: tuple[int, int], width: float = 1.5
-) -> DepthMap:
+def depth(source: SampleBands, slopes: Sequence[float], width: float = 1.5) -> DepthMap:
     """The slope at which the views agree best, with its confidence, one value a pitch.
 
-    samples: of one capture.
+    source: samples of one capture.
     slopes: at least three, rising.
-    shape: (rows, columns) of the map.
     width: of the Gaussian over which disagreement is averaged, pitches.
 
     Disagreement is the variance of what meets a point beyond that of the picture's own slant within
@@ -54,46 +60,40 @@ def depth(
     docs/model.md, "Refocusing and depth".
     """
     tried = np.asarray(slopes, float)
-    return _map(samples, tried, _disagreements(samples, tried, shape, width), width)
+    return _map(source, tried, _disagreements(source, tried, width), width)
 
 
 def depth_in_reach(
-    samples: Samples, slopes: Sequence[float], shape: tuple[int, int], width: float = 1.5
+    source: SampleBands, slopes: Sequence[float], width: float = 1.5
 ) -> tuple[DepthMap, np.ndarray]:
     """`depth` over a range that grows, at the spacing of `slopes`, on the side on which lenslets
     with texture lie beyond it; at most to where neighbouring pixels of a superpixel see the scene a
     pitch apart, a slope of as many as a pitch has pixels, and to MOST.
 
-    samples, shape, width: as in `depth`.
+    source, width: as in `depth`.
     slopes: (plane,) at least three, rising, evenly spaced.
 
     Returns the map and the slopes (plane,) that were tried.
     """
     tried = np.asarray(slopes, float)
     gap = tried[1] - tried[0]
-    disagreement = _disagreements(samples, tried, shape, width)
+    disagreement = _disagreements(source, tried, width)
     for side in (-1, 1):
         while _beyond(disagreement, side) > FEW:
             end = tried[0 if side < 0 else -1]
             more = end + side * gap * np.arange(1, 1 + GROWTH)
-            more = np.sort(more[np.abs(more) <= min(samples.pitch, MOST)])
+            more = np.sort(more[np.abs(more) <= min(source.pitch, MOST)])
             if more.size == 0:
                 break
-            parts = [_disagreements(samples, more, shape, width), disagreement]
+            parts = [_disagreements(source, more, width), disagreement]
             disagreement = np.concatenate(parts[::-side])
             tried = np.concatenate([more, tried][::-side])
-    return _map(samples, tried, disagreement, width), tried
+    return _map(source, tried, disagreement, width), tried
 
 
-def all_in_focus(samples: Samples, slope: np.ndarray, shape: tuple[int, int]) -> np.ndarray | None:
-    """The picture in which every lenslet is refocused by its own slope.
-
-    samples: of one capture.
-    slope: (row, column), one value a pitch; NaN takes the nearest known one.
-    shape: (rows, columns) of the map.
-
-    Returns (channel, row, column), like `in_colour`; None where no slope is known.
-    docs/model.md, "Refocusing and depth".
+def filled(slope: np.ndarray) -> np.ndarray | None:
+    """A map of slopes (row, column) in which every lenslet has one: NaN takes the nearest known
+    one. None where no slope is known.
     """
     from scipy.ndimage import distance_transform_edt
 
@@ -101,29 +101,53 @@ def all_in_focus(samples: Samples, slope: np.ndarray, shape: tuple[int, int]) ->
     if unknown.all():
         return None
     nearest = distance_transform_edt(unknown, return_distances=False, return_indices=True)
-    return in_colour(samples, _own(samples, slope[tuple(nearest)]), shape)
+    return slope[tuple(nearest)]
 
 
-def _own(samples: Samples, slope: np.ndarray) -> np.ndarray:
-    """(sample,) slope of each sample's lenslet, from a map (row, column)."""
-    from scipy.ndimage import map_coordinates
+def together(source: SampleBands, slopes: np.ndarray, step: int, waiting: int = 0) -> list[slice]:
+    """Which planes are worked on together.
 
-    places = samples.centres.T / samples.pitch - 0.5
-    own = map_coordinates(slope, places, order=1, mode="nearest")
-    return own.astype(np.float32)[samples.lenslet]
+    slopes: of all.
+    waiting: rows of pictures that are held until others come.
+    """
+    reach = displacement(source, slopes, step)
+    return bands(len(slopes), together_bytes() // plane_bytes(source, reach, step, waiting))
 
 
-def _map(samples: Samples, tried: np.ndarray, disagreement: np.ndarray, width: float) -> DepthMap:
+def together_bytes() -> int:
+    """Memory for planes that are worked on together, unless one takes more."""
+    least, most = TOGETHER
+    return min(max(budget().memory // SHARE, least), most)
+
+
+def plane_bytes(source: SampleBands, reach: int, step: int, waiting: int = 0) -> int:
+    """Memory that a plane takes while it is worked on.
+
+    reach: points, of the displacement.
+    step, waiting: as of `together`.
+    """
+    most = max(rows.stop - rows.start for rows in source.rows)
+    rows = min(step * (most + 2) + 2 * reach + waiting, step * source.shape[0] + waiting)
+    return SUMS_BYTES * source.count * rows * step * source.shape[1]
+
+
+def _map(
+    source: SampleBands, tried: np.ndarray, disagreement: np.ndarray, width: float
+) -> DepthMap:
     """The map of the least disagreement (plane, row, column)."""
-    least, contrast = _least(disagreement, tried)
-    shape = (least.shape[0], least.shape[1])
-    textured = contrast > FLAT
-    beyond = textured & _at_edge(disagreement)
-    found = least
+
+    def first(part: np.ndarray) -> tuple[np.ndarray, ...]:
+        least, contrast = _least(part, tried)
+        textured = contrast > FLAT
+        return least, textured, textured & _at_edge(part)
+
+    found, textured, beyond = _by_rows(first, disagreement)
     for _ in range(ROUNDS):
-        found = np.clip(found + _correction(samples, found, shape, width), tried[0], tried[-1])
+        found = np.clip(found + _correction(source, found, width), tried[0], tried[-1])
     inside = (found > tried[0]) & (found < tried[-1])
-    confidence, sigma = _certainty(disagreement, tried, found)
+    confidence, sigma = _by_rows(
+        lambda part, slope: _certainty(part, tried, slope), disagreement, found
+    )
     known = textured & ~beyond & inside & (confidence >= LIKELY)
     slope = np.where(known, _steady(found, np.where(known, 1 / sigma**2, 0.0)), np.nan)
     return DepthMap(
@@ -135,26 +159,48 @@ def _map(samples: Samples, tried: np.ndarray, disagreement: np.ndarray, width: f
     )
 
 
+def _by_rows(
+    work: Callable[..., tuple[np.ndarray, ...]], disagreement: np.ndarray, *maps: np.ndarray
+) -> tuple[Any, ...]:
+    """What `work` makes of each point of the disagreement (plane, row, column), float64, and of
+    maps (row, column): maps of its own.
+    """
+    planes, rows, columns = disagreement.shape
+    parts = [
+        work(disagreement[:, some].astype(float), *(values[some] for values in maps))
+        for some in bands(rows, AT_ONCE // (planes * columns))
+    ]
+    return tuple(np.concatenate(of_each) for of_each in zip(*parts))
+
+
 def _steady(slope: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """The map s of least sum of weight (s - slope)^2 / 2 + |steps between neighbours|, by
     reweighted least squares; weight 0 takes what lies around. (row, column) each.
     """
-    from scipy import sparse
-    from scipy.sparse.linalg import cg
+    from scipy.sparse.linalg import LinearOperator, cg
 
     if not weight.any():
         return slope
-    rows, columns = (sparse.diags([-1.0, 1.0], [0, 1], shape=(n - 1, n)) for n in slope.shape)
-    down, right = sparse.eye(slope.shape[0]), sparse.eye(slope.shape[1])
-    steps = sparse.vstack([sparse.kron(rows, right), sparse.kron(down, columns)]).tocsr()
-    data = sparse.diags(weight.ravel())
     middle = float((weight * slope).sum() / weight.sum())
-    found = np.where(weight > 0, slope, middle).ravel()
+    found = np.where(weight > 0, slope, middle)
+    data = (weight * slope).ravel()
     for _ in range(STEADY):
-        size = np.hypot(steps @ found, STEP_OF_ROUNDING)
-        matrix = data + steps.T @ sparse.diags(1 / size) @ steps
-        found, _ = cg(matrix, data @ slope.ravel(), x0=found, rtol=1e-6, maxiter=500)
-    return found.reshape(slope.shape)
+        pulls = [1 / np.hypot(np.diff(found, axis=axis), STEP_OF_ROUNDING) for axis in (0, 1)]
+
+        def product(values: np.ndarray, pulls: list[np.ndarray] = pulls) -> np.ndarray:
+            plane = values.reshape(slope.shape)
+            out = weight * plane
+            down, right = (pull * np.diff(plane, axis=axis) for axis, pull in enumerate(pulls))
+            out[:-1] -= down
+            out[1:] += down
+            out[:, :-1] -= right
+            out[:, 1:] += right
+            return out.ravel()
+
+        matrix = LinearOperator((slope.size, slope.size), matvec=product, dtype=np.float64)
+        solved, _ = cg(matrix, data, x0=found.ravel(), rtol=1e-6, maxiter=500)
+        found = solved.reshape(slope.shape)
+    return found
 
 
 def _certainty(
@@ -194,11 +240,24 @@ def _edges(slope: np.ndarray, sigma: np.ndarray) -> np.ndarray:
     return known & (top - bottom >= 1)
 
 
-def _disagreements(
-    samples: Samples, slopes: np.ndarray, shape: tuple[int, int], width: float
-) -> np.ndarray:
-    """(plane, row, column), NaN where nothing meets a point."""
-    return np.array([_disagreement(samples, slope, shape, width) for slope in slopes])
+def _disagreements(source: SampleBands, slopes: np.ndarray, width: float) -> np.ndarray:
+    """(plane, row, column) float32, NaN where nothing meets a point."""
+    found = np.empty((len(slopes), *source.shape), np.float32)
+    waiting = 2 * (_coarse(source, width)[0].stop + int(8 * width))
+    for some in together(source, slopes, 2, waiting):
+        streams = shared(source, some.stop - some.start)
+        planes = [_disagreement(*both, source, width) for both in zip(streams, slopes[some])]
+        for rows, parts in zip(_coarse(source, width), zip(*planes)):
+            found[some, rows] = parts
+    return found
+
+
+def _coarse(source: SampleBands, width: float) -> list[slice]:
+    """Rows of a picture over which disagreement is averaged together: bands of the source, many
+    enough for what lies around to be few beside them.
+    """
+    each = max(rows.stop - rows.start for rows in source.rows)
+    return bands(source.shape[0], each * -(-int(4 * width) // each))
 
 
 def _at_edge(disagreement: np.ndarray, sides: Sequence[int] = (-1, 1)) -> np.ndarray:
@@ -210,8 +269,11 @@ def _at_edge(disagreement: np.ndarray, sides: Sequence[int] = (-1, 1)) -> np.nda
 
 def _beyond(disagreement: np.ndarray, side: int) -> float:
     """Share of the lenslets, with texture, that agree best on the first (side -1) or last plane."""
-    textured = _contrast(disagreement) > FLAT
-    return float(np.mean(textured & _at_edge(disagreement, (side,))))
+
+    def lost(part: np.ndarray) -> tuple[np.ndarray]:
+        return ((_contrast(part) > FLAT) & _at_edge(part, (side,)),)
+
+    return float(np.mean(_by_rows(lost, disagreement)[0]))
 
 
 def _contrast(disagreement: np.ndarray) -> np.ndarray:
@@ -222,37 +284,67 @@ def _contrast(disagreement: np.ndarray) -> np.ndarray:
 
 
 def _disagreement(
-    samples: Samples, slope: float, shape: tuple[int, int], width: float
-) -> np.ndarray:
-    """How far apart what meets a point of the plane of this slope is, (row, column), NaN where
-    nothing does: the variance within each colour, by their light, or how little the bands of
-    spectra go together.
+    bands_of: Parts, slope: float, source: SampleBands, width: float
+) -> Iterator[np.ndarray]:
+    """How far apart what meets a point of the plane of this slope is, (row, column) of each band
+    of `_coarse`, NaN where nothing does: the variance within each colour, by their light, or how
+    little the bands of spectra go together.
+
+    bands_of: all bands of the source.
     """
-    channels, parts = samples.channels, samples.parts()
+    channels, streams = source.channels, shared(bands_of, source.count)
     if channels is not None and channels.wavelengths is not None:
-        found = _uncorrelated(in_colour(samples, slope, shape, step=2), width)
-    else:
-        colours = [samples.where(some) for some in parts]
-        lit = [len(colour.value) > 0 for colour in colours]
-        each = [_variance(c, slope, shape, width) for c, some in zip(colours, lit) if some]
-        weights = np.ones(1) if channels is None else channels.weights[lit]
-        share = np.isfinite(each) * weights[:, None, None]
+        seen = (pictures(stream, source, n, slope, 2) for n, stream in enumerate(streams))
+        parts = (np.stack(channel) for channel in zip(*seen))
+        floor = 1e-5 * float(source.survey.square.mean())
+        for own, part in _around(parts, source, width):
+            yield _of_lenslets(_uncorrelated(part, width, floor)[own])
+        return
+    weights = np.ones(1) if channels is None else channels.weights
+    each = [_variance(stream, source, n, slope) for n, stream in enumerate(streams)]
+    floors = 1e-9 * source.survey.square
+    for parts in zip(*(_around(variance, source, width) for variance in each)):
+        found = []
+        for (own, part), floor in zip(parts, floors):
+            known = np.isfinite(part)
+            mean = np.maximum(_smooth(part, known, width), 0) + floor
+            found.append(np.where(known, mean, np.nan)[own])
+        share = np.isfinite(found) * weights[:, None, None]
+        total = (np.nan_to_num(found) * share).sum(axis=0)
         with np.errstate(invalid="ignore"):
-            total = (np.nan_to_num(each) * share).sum(axis=0)
-            found = total / np.where(share.sum(axis=0) > 0, share.sum(axis=0), np.nan)
-    return found.reshape(shape[0], 2, shape[1], 2).mean(axis=(1, 3))
+            yield _of_lenslets(total / np.where(share.sum(axis=0) > 0, share.sum(axis=0), np.nan))
 
 
-def _variance(samples: Samples, slope: float, shape: tuple[int, int], width: float) -> np.ndarray:
-    """Variance of what meets a point of a plane, two points a pitch, beyond that of the picture's
-    own slant.
+def _of_lenslets(values: np.ndarray) -> np.ndarray:
+    """(row, column) means of values at two points a pitch."""
+    return values.reshape(len(values) // 2, 2, -1, 2).mean(axis=(1, 3))
+
+
+def _around(
+    parts: Iterator[np.ndarray], source: SampleBands, width: float
+) -> Iterator[tuple[slice, np.ndarray]]:
+    """The bands of `_coarse`, two points a pitch, with what a Gaussian reaches around them, and
+    which rows of these are theirs.
     """
-    floor = 1e-9 * float(np.mean(samples.value**2, dtype=float))
-    picture, variance = refocus(samples, slope, shape, step=2)
-    for part in np.gradient(picture):
-        variance = variance - (2 * part) ** 2 / 6  # a tent of a pitch to each side has 1/6
-    known = np.isfinite(variance)
-    return np.where(known, np.maximum(_smooth(variance, known, width), 0) + floor, np.nan)
+    own = [slice(2 * rows.start, 2 * rows.stop) for rows in _coarse(source, width)]
+    around = [widened(rows, int(8 * width + 0.5), 2 * source.shape[0]) for rows in own]
+    for rows, more, part in zip(own, around, windows(parts, around)):
+        yield slice(rows.start - more.start, rows.stop - more.start), part
+
+
+def _variance(
+    bands_of: Parts, source: SampleBands, number: int, slope: float
+) -> Iterator[np.ndarray]:
+    """Variance of what meets a point of a plane, two points a pitch, beyond that of the picture's
+    own slant, of one channel.
+    """
+    own = [slice(2 * rows.start, 2 * rows.stop) for rows in source.rows]
+    around = [widened(rows, 1, 2 * source.shape[0]) for rows in own]
+    parts = pictures(bands_of, source, number, slope, 2, squares=True)
+    for rows, more, (picture, variance) in zip(own, around, windows(parts, around)):
+        for part in np.gradient(picture):
+            variance = variance - (2 * part) ** 2 / 6  # a tent of a pitch to each side has 1/6
+        yield variance[rows.start - more.start : rows.stop - more.start]
 
 
 def _smooth(values: np.ndarray, known: np.ndarray, width: float) -> np.ndarray:
@@ -264,15 +356,17 @@ def _smooth(values: np.ndarray, known: np.ndarray, width: float) -> np.ndarray:
         return gaussian_filter(np.where(known, values, 0.0), 2 * width) / weight
 
 
-def _uncorrelated(pictures: np.ndarray, width: float) -> np.ndarray:
+def _uncorrelated(seen: np.ndarray, width: float, floor: float) -> np.ndarray:
     """How little pictures (channel, row, column) of one place go together: the determinant of
     their correlations over a Gaussian, 0 where each tells the others, 1 where none does.
+
+    floor: added to their variances.
 
     Bando, Chen and Nishita, Extracting depth and matte using a color-filtered aperture, ACM
     Transactions on Graphics 27 (2008) 134.
     """
-    known = np.isfinite(pictures).all(axis=0)
-    values = np.where(known, pictures, 0.0)
+    known = np.isfinite(seen).all(axis=0)
+    values = np.where(known, seen, 0.0)
     count = len(values)
     mean = [_smooth(value, known, width) for value in values]
     moments = np.empty((*known.shape, count, count))
@@ -280,7 +374,7 @@ def _uncorrelated(pictures: np.ndarray, width: float) -> np.ndarray:
         for j in range(i, count):
             both = _smooth(values[i] * values[j], known, width) - mean[i] * mean[j]
             moments[..., i, j] = moments[..., j, i] = both
-    moments = np.nan_to_num(moments) + 1e-5 * np.mean(values**2) * np.eye(count)
+    moments = np.nan_to_num(moments) + floor * np.eye(count)
     spread = np.einsum("...ii->...i", moments)
     return np.where(known, np.linalg.det(moments) / spread.prod(axis=-1), np.nan)
 
@@ -300,9 +394,7 @@ def _least(disagreement: np.ndarray, slopes: np.ndarray) -> tuple[np.ndarray, np
     return found, _contrast(disagreement)
 
 
-def _correction(
-    samples: Samples, slope: np.ndarray, shape: tuple[int, int], width: float
-) -> np.ndarray:
+def _correction(source: SampleBands, slope: np.ndarray, width: float) -> np.ndarray:
     """By how much the slope (row, column) should change, from how the samples of each colour differ
     from the picture p at their places: at a wrong slope v - p = ds (grad p . q), solved for ds by
     least squares over a Gaussian of `width` pitches; at most half a unit. 0 for bands, of which a
@@ -310,42 +402,54 @@ def _correction(
     """
     from scipy.ndimage import gaussian_filter
 
-    if samples.channels is not None and samples.channels.wavelengths is not None:
-        return np.zeros(shape)
-    weights = np.ones(1) if samples.channels is None else samples.channels.weights
-    top, bottom = np.zeros(shape), np.zeros(shape)
-    for some, weight in zip(samples.parts(), weights, strict=True):
-        colour = samples.where(some)
-        if len(colour.value):
-            slant, square = _slants(colour, slope, shape)
-            top += weight * slant
-            bottom += weight * square
-    top, bottom = (gaussian_filter(part, width, mode="constant") for part in (top, bottom))
+    if source.channels is not None and source.channels.wavelengths is not None:
+        return np.zeros(source.shape)
+    weights = np.ones(1) if source.channels is None else source.channels.weights
+    sums = np.zeros((2, *source.shape))
+    streams = shared(source, source.count)
+    each = [_slants(stream, source, n, slope) for n, stream in enumerate(streams)]
+    for rows, parts in zip(source.rows, zip(*each)):
+        for weight, part in zip(weights, parts, strict=True):
+            sums[:, rows] += weight * part
+    top, bottom = (gaussian_filter(part, width, mode="constant") for part in sums)
     return np.clip(top / np.maximum(bottom, 1e-30 + 1e-6 * bottom.max()), -0.5, 0.5)
 
 
 def _slants(
-    samples: Samples, slope: np.ndarray, shape: tuple[int, int]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Sums over the samples of each lenslet, (row, column): of (v - p)(grad p . q), and of the
-    square of (grad p . q).
+    bands_of: Parts, source: SampleBands, number: int, slope: np.ndarray
+) -> Iterator[np.ndarray]:
+    """Sums over the samples of each lenslet, (2, row, column) of each band: of (v - p)(grad p . q),
+    and of the square of (grad p . q); of one channel.
     """
     from scipy.ndimage import map_coordinates
 
-    own = _own(samples, slope)
-    picture, _ = refocus(samples, own, shape, step=STEP)
-    picture = np.where(np.isfinite(picture), picture, np.nanmean(picture))
-    layers, sums = (picture, *np.gradient(picture)), np.zeros((2, shape[0] * shape[1]))
-    for some in bands(len(samples.value), AT_ONCE):
-        part = samples.where(some)
-        where = place(part, own[some], STEP).T
+    now, late = shared(bands_of, 2)
+    reach = displacement(source, slope, STEP) + 2
+    around = [
+        widened(slice(STEP * rows.start, STEP * rows.stop), reach, STEP * source.shape[0])
+        for rows in source.rows
+    ]
+    parts = windows(pictures(now, source, number, slope), around)
+    for rows, more, picture, samples in zip(source.rows, around, parts, late):
+        part = samples[number]
+        shape = rows.stop - rows.start, source.shape[1]
+        if not len(part.value):
+            yield np.zeros((2, *shape))
+            continue
+        picture = np.where(np.isfinite(picture), picture, source.survey.mean[number])
+        where = np.stack(place(part, slope, STEP)) - [[more.start], [0]]
         value, down, right = (
-            map_coordinates(layer, where, order=1, mode="nearest") for layer in layers
+            map_coordinates(layer, where, order=1, mode="nearest")
+            for layer in (picture, *np.gradient(picture))
         )
         along = (down * part.offset[:, 0] + right * part.offset[:, 1]) * (STEP / part.pitch)
-        cell = np.clip((part.centre / part.pitch).astype(int), 0, np.array(shape) - 1)
-        index = cell[:, 0] * shape[1] + cell[:, 1]
-        for total, weights in zip(sums, ((part.value - value) * along, along**2)):
-            first = index.min()
-            total[first : index.max() + 1] += np.bincount(index - first, weights)
-    return sums[0].reshape(shape), sums[1].reshape(shape)
+        cell = (part.centres / part.pitch).astype(int) - [rows.start, 0]
+        row, column = np.clip(cell, 0, np.subtract(shape, 1)).T
+        index = (row * shape[1] + column)[part.lenslet]
+        yield np.reshape(
+            [
+                np.bincount(index, weights, minlength=shape[0] * shape[1])
+                for weights in ((part.value - value) * along, along**2)
+            ],
+            (2, *shape),
+        )

@@ -3,81 +3,140 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from plenocli.base.budget import budget
 from plenocli.base.errors import InputError
-from plenocli.base.tiling import Plane
+from plenocli.base.tiling import EVERYTHING, Plane, bands
 from plenocli.forward.sensor.cfa import cfa_map
-from plenocli.inverse.lightfield.samples import AT_ONCE, Channels, Samples, collect, joined
+from plenocli.inverse.lightfield.samples import (
+    AT_ONCE,
+    TEMPORARY_BYTES,
+    Channels,
+    SampleBands,
+    Samples,
+    collect,
+    joined,
+    picture_rows,
+    unlit,
+)
 
 if TYPE_CHECKING:
     from plenocli.forward.sensor.capture import Capture
     from plenocli.inverse.calibration.calibration import Calibration
 
-PIXEL_BYTES, LENSLET_BYTES, PLANE_BYTES, TEMPORARY_BYTES = 14, 1150, 72, 140
-"""Memory for each pixel of the capture, for each lenslet, for each lenslet and each plane, and for
-each of the pixels that are worked on together (measured).
-"""
+PIXEL_BYTES = 14
+"""Memory for each pixel of a capture whose samples are held."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Sensor:
+    """What the samples of a capture are made of.
+
+    signal: (row, column) the light of the capture.
+    white: (row, column) of each channel, that of white; 0 where a pixel has another colour.
+    light: (channel,) of white, on the whole.
+    centres: (lenslet, 2) px, row and column, of superpixels.
+    pitch: lenslet spacing, px.
+    """
+
+    signal: Plane
+    white: list[Plane]
+    light: list[float]
+    centres: np.ndarray
+    pitch: float
 
 
 def samples_of(
     capture: Capture,
     calibration: Calibration | None = None,
     *,
-    planes: int = 1,
     where: str | Path | None = None,
 ) -> tuple[Samples, tuple[int, int]]:
+    """All samples of a capture, in memory; as `bands_of`.
+
+    Returns the samples and (rows, columns) of a picture, in lenslet pitches.
+    Raises as bands_of; NumericsError where memory does not suffice.
+    """
+    source = bands_of(capture, calibration, where=where)
+    needed = source.held + PIXEL_BYTES * math.prod(capture.shape) + TEMPORARY_BYTES * AT_ONCE
+    budget().require(needed, "looking at all pixels", source.where, "cut the capture")
+    found = [joined(parts) for parts in zip(*source)]
+    if not any(part.value.size for part in found):
+        raise unlit(source.where)
+    return found[0] if source.channels is None else joined(found, source.channels), source.shape
+
+
+def bands_of(
+    capture: Capture,
+    calibration: Calibration | None = None,
+    *,
+    where: str | Path | None = None,
+) -> SampleBands:
     """Samples of a capture, along a calibration's grid or the tiles that it tells of itself.
 
     Pixels of a colour filter array keep their colours apart: each is a sample of its own colour,
     relative to what its own pixel has of white, and none is interpolated.
+    capture: of which no more than some rows are in memory where its mosaic is a Plane.
     calibration: with the white image of this sensor; None: the capture was simulated.
-    planes: that will be made of them, for the memory that they need.
     where: the calibration's file, for messages.
 
-    Returns the samples and (rows, columns) of a picture, in lenslet pitches.
-    Raises InputError where lenslets or light are missing; NumericsError where memory does not
-    suffice.
+    Raises InputError where lenslets are missing, or light where samples are asked for.
     docs/model.md, "Refocusing and depth".
     """
-    pixels = math.prod(capture.shape)
-    told = None if capture.grid is None else capture.grid.shape
-    side = float(np.mean(calibration.grid.pitch if calibration is not None else told or 1))
-    lenslets = pixels / side**2
-    budget().require(
-        pixels * PIXEL_BYTES
-        + lenslets * (LENSLET_BYTES + PLANE_BYTES * planes)
-        + min(pixels, AT_ONCE) * TEMPORARY_BYTES,
-        "refocusing",
-        capture.metadata.path,
-        "cut the capture",
+    colour = capture.cfa != "mono"
+    letters = [letter for letter in "RGB" if letter in capture.cfa] if colour else [None]
+    sensor = (
+        _along_tiles(capture, letters)
+        if calibration is None
+        else _along_grid(capture, calibration, where, letters)
     )
-    letters = [letter for letter in "RGB" if letter in capture.cfa]
-    if capture.cfa == "mono":
-        samples = _grey(capture, calibration, where, None)[0]
-    else:
-        found = [_grey(capture, calibration, where, letter) for letter in letters]
-        light = np.array([level for _, level in found])
+    shape, pitch = _pitches(capture.shape, sensor.pitch), sensor.pitch
+    cell = picture_rows(sensor.centres, pitch, shape[0])
+    centres = sensor.centres[np.argsort(cell, kind="stable")]
+    rows = bands(shape[0], int(AT_ONCE * shape[0] / math.prod(capture.shape)))
+    ends = np.searchsorted(np.sort(cell), [0, *(part.stop for part in rows)])
+
+    def read(number: int) -> tuple[Samples, ...]:
+        own = centres[ends[number] : ends[number + 1]]
+        low, high = own[:, 0].min(initial=shape[0] * pitch), own[:, 0].max(initial=0)
+        first, last = (int(n) for n in np.clip([low - pitch, high + pitch], 0, capture.shape[0]))
+        seen, corner = slice(first, max(last, first)), np.array([first, 0])
+        signal = sensor.signal.read(seen, EVERYTHING)
+        every = np.ones(len(own), bool)
+        parts = (
+            collect(signal, white.read(seen, EVERYTHING), own - corner, every, pitch)
+            for white in sensor.white
+        )
+        return tuple(replace(part, centres=own) for part in parts)
+
+    channels = None
+    if colour:
+        light = np.array(sensor.light)
         matrix = np.eye(3) if capture.profile is None else capture.profile.to_rgb
-        samples = joined(
-            [part for part, _ in found],
-            Channels(
-                names=tuple(letters),
-                to_rgb=matrix[:, ["RGB".index(letter) for letter in letters]],
-                weights=light / max(light.sum(), 1e-30),
-            ),
+        channels = Channels(
+            names=tuple(str(letter) for letter in letters),
+            to_rgb=matrix[:, ["RGB".index(str(letter)) for letter in letters]],
+            weights=light / max(light.sum(), 1e-30),
         )
-    if samples.value.size == 0:
-        raise InputError(
-            "has no lit superpixel on the grid",
-            capture.metadata.path,
-            "check the white image and the calibration",
-        )
-    return samples, _pitches(capture.shape, samples.pitch)
+    images: list[Any] = [capture.mosaic]
+    if calibration is not None and calibration.white is not None:
+        images += [calibration.white.flat, calibration.dark and calibration.dark.mean]
+    return SampleBands(
+        shape=shape,
+        pitch=pitch,
+        channels=channels,
+        rows=tuple(rows),
+        read=read,
+        held=sum(image.nbytes for image in images if isinstance(image, np.ndarray)),
+        where=capture.metadata.path,
+    )
 
 
 def _pitches(shape: tuple[int, ...], pitch: float) -> tuple[int, int]:
@@ -165,18 +224,6 @@ def _middles(response: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     return np.stack([np.einsum("...pb,p->...b", share, axis) for axis in (rows, columns)], axis=-1)
 
 
-def _grey(
-    shot: Capture,
-    calibration: Calibration | None,
-    path: str | Path | None,
-    letter: str | None,
-) -> tuple[Samples, float]:
-    """(samples, mean light of white) of the pixels of one colour, or of all."""
-    if calibration is None:
-        return _along_tiles(shot, letter)
-    return _along_grid(shot, calibration, path, letter)
-
-
 def _lit(white: np.ndarray, cfa: str, letter: str | None, corner: tuple[int, int]) -> np.ndarray:
     """The light of white (row, column) of a part of the sensor, 0 where pixels have another colour.
 
@@ -189,9 +236,12 @@ def _lit(white: np.ndarray, cfa: str, letter: str | None, corner: tuple[int, int
 
 
 def _along_grid(
-    shot: Capture, calibration: Calibration, path: str | Path | None, letter: str | None
-) -> tuple[Samples, float]:
-    """Samples along the grid of a calibration, relative to its white image."""
+    shot: Capture,
+    calibration: Calibration,
+    path: str | Path | None,
+    letters: Sequence[str | None],
+) -> _Sensor:
+    """Along the grid of a calibration, relative to its white image."""
     white, grid = calibration.white, calibration.grid
     if white is None or white.flat is None or white.flat.shape != shot.shape:
         raise InputError(
@@ -208,18 +258,26 @@ def _along_grid(
         own = 0.0 if dark is None else dark.read(rows, columns)
         return (mosaic.read(rows, columns) - own) / level
 
-    def lit(rows: slice, columns: slice) -> np.ndarray:
+    def lit(rows: slice, columns: slice, letter: str | None = None) -> np.ndarray:
         corner = rows.start or 0, columns.start or 0
         return _lit(np.nan_to_num(flat.read(rows, columns)), shot.cfa, letter, corner)
 
-    signal, shown = Plane(mosaic.shape, light), Plane(mosaic.shape, lit)
-    made = collect(signal, shown, grid.centres, grid.valid, float(np.mean(grid.pitch)))
-    return made, float(sum(shown.window(band).sum() for band in shown.in_bands()))
+    shown = [Plane(mosaic.shape, partial(lit, letter=letter)) for letter in letters]
+    return _Sensor(
+        signal=Plane(mosaic.shape, light),
+        white=shown,
+        light=[
+            float(sum(plane.window(band).sum() for band in plane.in_bands()))
+            for plane in (shown if len(shown) > 1 else ())
+        ],
+        centres=grid.centres[grid.valid],
+        pitch=float(np.mean(grid.pitch)),
+    )
 
 
-def _along_tiles(shot: Capture, letter: str | None) -> tuple[Samples, float]:
-    """Samples along the superpixels that a simulated capture tells of, relative to what all of
-    them have in common, which stands for a white image.
+def _along_tiles(shot: Capture, letters: Sequence[str | None]) -> _Sensor:
+    """Along the superpixels that a simulated capture tells of, relative to what all of them have in
+    common, which stands for a white image.
     """
     size = shot.grid.shape if shot.grid else None
     if size is None or shot.shape[0] % size[0] or shot.shape[1] % size[1]:
@@ -233,28 +291,27 @@ def _along_tiles(shot: Capture, letter: str | None) -> tuple[Samples, float]:
     def light(rows: slice, columns: slice) -> np.ndarray:
         return shot.window(rows, columns).signal()
 
-    seen, number = np.zeros(size), np.zeros(size)
+    seen, number = np.zeros((2, len(letters), *size))
     signal = Plane(shape, light)
     for rows in signal.in_bands(size[0]):
         values = signal.window(rows)
-        counted = _lit(np.ones(values.shape), shot.cfa, letter, (rows.start, 0)) > 0
-        tiles = -1, size[0], count[1], size[1]
-        seen += np.where(counted, values, 0.0).reshape(tiles).sum(axis=(0, 2))
-        number += counted.reshape(tiles).sum(axis=(0, 2))
+        for channel, letter in enumerate(letters):
+            counted = _lit(np.ones(values.shape), shot.cfa, letter, (rows.start, 0)) > 0
+            tiles = -1, size[0], count[1], size[1]
+            seen[channel] += np.where(counted, values, 0.0).reshape(tiles).sum(axis=(0, 2))
+            number[channel] += counted.reshape(tiles).sum(axis=(0, 2))
     mean = seen / np.maximum(number, 1)
-    top = mean.max() if mean.max() > 0 else 1.0
 
-    def lit(rows: slice, columns: slice) -> np.ndarray:
+    def lit(rows: slice, columns: slice, channel: int = 0) -> np.ndarray:
         down, right = (np.arange(*part.indices(n)) for part, n in zip((rows, columns), shape))
-        flat = (mean / top)[down[:, None] % size[0], right % size[1]]
-        return _lit(flat, shot.cfa, letter, (int(down[0]), int(right[0])))
+        flat = mean[channel][down[:, None] % size[0], right % size[1]]
+        return _lit(flat, shot.cfa, letters[channel], (rows.start or 0, columns.start or 0))
 
     places = ((np.arange(n) + 0.5) * s - 0.5 for n, s in zip(count, size))
-    made = collect(
-        signal.through(lambda values: values / top),
-        Plane(shape, lit),
-        np.stack(np.meshgrid(*places, indexing="ij"), axis=-1),
-        np.ones(count, bool),
-        float(np.mean(size)),
+    return _Sensor(
+        signal=signal,
+        white=[Plane(shape, partial(lit, channel=n)) for n in range(len(letters))],
+        light=[float((n * m).sum()) for n, m in zip(number, mean)],
+        centres=np.stack(np.meshgrid(*places, indexing="ij"), axis=-1).reshape(-1, 2),
+        pitch=float(np.mean(size)),
     )
-    return made, float((number * mean).sum())

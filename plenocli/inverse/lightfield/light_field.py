@@ -2,22 +2,45 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
-from plenocli.inverse.lightfield import refocus as focus
-from plenocli.inverse.lightfield.depth import all_in_focus, depth, depth_in_reach
+from plenocli.base.budget import budget
+from plenocli.base.tiling import shared, widened, windows
+from plenocli.inverse.lightfield.depth import (
+    depth,
+    depth_in_reach,
+    filled,
+    plane_bytes,
+    together,
+    together_bytes,
+)
 from plenocli.inverse.lightfield.optics import MicroscopeOptics, Optics
 from plenocli.inverse.lightfield.planes import Colours, DepthMap, LightField
-from plenocli.inverse.lightfield.samples import Samples
+from plenocli.inverse.lightfield.refocus import STEP, Parts, pictures, views_in_bands
+from plenocli.inverse.lightfield.samples import AT_ONCE, TEMPORARY_BYTES, SampleBands
+
+Room = Callable[[tuple[int, ...]], Any]
 
 RANGE = 3.0
 """Slopes from -RANGE to RANGE are searched first where no distances are given: a lenslet's width of
 parallax across the pupil is one.
 """
-WIDER = 4
+WIDER = 2
 """Times its first width to which a range that grows is reckoned with, for memory."""
+MAP_BYTES, WAITING, WAITING_BYTES = 64, 4, 4 << 20
+"""Memory for each lenslet of the maps of depth; how many bands wait for others, at most, and memory
+for each (measured).
+"""
+
+
+def in_memory(shape: tuple[int, ...]) -> np.ndarray:
+    """Room for pictures in memory."""
+    return np.empty(shape, np.float32)
 
 
 def usual_slopes(planes: int = 13) -> np.ndarray:
@@ -26,43 +49,41 @@ def usual_slopes(planes: int = 13) -> np.ndarray:
 
 
 def refocused(
-    samples: Samples,
-    shape: tuple[int, int],
+    source: SampleBands,
     slopes: np.ndarray,
     *,
     views: int = 3,
     optics: Optics | MicroscopeOptics | None = None,
     grow: bool = False,
+    room: Room = in_memory,
+    copies: int = 1,
 ) -> LightField:
     """Planes, depth map and views of the samples of a capture.
 
-    shape: (rows, columns) of a picture, in lenslet pitches.
     slopes: (plane,) px per px, rising; a depth map needs at least three.
     views: along each side, 0 for none.
     optics: turns slopes into distances.
     grow: widens evenly spaced slopes, three or more, until what has texture is within them.
+    room: what gives arrays for pictures by their shape; rows of their last two axes are put into
+        them, one band after the other.
+    copies: of all pictures that there are in memory at a time, in the end; for what is needed.
 
+    Raises NumericsError where memory does not suffice, InputError where no pixel is lit.
     docs/model.md, "Refocusing and depth".
     """
+    _require(source, slopes, views, copies, WIDER if grow else 1)
     found = None
     if len(slopes) >= 3 and grow:
-        found, slopes = depth_in_reach(samples, slopes.tolist(), shape)
+        found, slopes = depth_in_reach(source, slopes.tolist())
+        _require(source, slopes, views, copies)
     elif len(slopes) >= 3:
-        found = depth(samples, slopes.tolist(), shape)
+        found = depth(source, slopes.tolist())
     if found is not None and optics is not None:
         found = in_metres(found, optics)
-    channels = len(samples.parts())
-    points = tuple(focus.STEP * n for n in shape)
-    grey = np.empty((len(slopes), *points), np.float32)
-    coloured = np.empty((len(slopes), channels if samples.channels else 0, *points), np.float32)
-    sharpness = np.empty(len(slopes))
-    for number, slope in enumerate(slopes):
-        picture = focus.in_colour(samples, slope, shape)
-        mean = known_mean(picture, 0)
-        grey[number], coloured[number] = mean, picture[: coloured.shape[1]]
-        sharpness[number] = focus.sharpness(mean)
-    sharp = None if found is None else all_in_focus(samples, found.slope, shape)
-    seen = focus.views_in_colour(samples, views, shape) if views else None
+    grey, coloured, sharpness = _planes(source, slopes, room)
+    own = None if found is None else filled(found.slope)
+    sharp, tinted = (None, None) if own is None else _in_focus(source, own, room)
+    seen, through = _views(source, views, room) if views else (None, None)
     return LightField(
         pictures=grey,
         slopes=slopes,
@@ -71,12 +92,109 @@ def refocused(
         spacing=None if optics is None else optics.spacing,
         microscope=isinstance(optics, MicroscopeOptics),
         depth=found,
-        sharp=None if sharp is None else known_mean(sharp, 0),
-        views=None if seen is None else known_mean(seen, 2),
+        sharp=sharp,
+        views=seen,
         colours=None
-        if samples.channels is None
-        else Colours(channels=samples.channels, pictures=coloured, sharp=sharp, views=seen),
+        if source.channels is None
+        else Colours(channels=source.channels, pictures=coloured, sharp=tinted, views=through),
     )
+
+
+def _require(
+    source: SampleBands, slopes: np.ndarray, views: int, copies: int, wider: int = 1
+) -> None:
+    """NumericsError where there is not the memory to refocus; wider: times as many planes that may
+    be tried, see WIDER; the others as of `refocused`.
+    """
+    lenslets, colours = source.shape[0] * source.shape[1], source.count
+    reach = math.ceil(float(np.abs(slopes).max()) * math.sqrt(0.5) * STEP) + 1
+    plane = plane_bytes(source, reach, STEP)
+    needed = source.held + min(lenslets * source.pitch**2, AT_ONCE) * TEMPORARY_BYTES
+    needed += min(len(slopes) * plane, max(together_bytes(), plane))
+    needed += WAITING_BYTES * min(len(source.rows) - 1, WAITING)
+    needed += lenslets * max(MAP_BYTES, 4 * wider * len(slopes)) * (len(slopes) >= 3)
+    fewer = "cut the capture"
+    if copies:
+        values = (len(slopes) + 1) * STEP**2 + views**2
+        needed += 4 * copies * lenslets * values * (1 if source.channels is None else 1 + colours)
+        fewer = "take an .h5, whose pictures stay in a file, or fewer planes"
+    budget().require(needed, "refocusing", source.where, fewer)
+
+
+def _points(source: SampleBands, step: int = STEP) -> list[slice]:
+    """Rows of a picture of each band."""
+    return [slice(step * rows.start, step * rows.stop) for rows in source.rows]
+
+
+def _room(
+    source: SampleBands, room: Room, step: int, lead: tuple[int, ...] = ()
+) -> tuple[Any, Any]:
+    """Room for pictures in grey, and in colour where there are channels."""
+    points = step * source.shape[0], step * source.shape[1]
+    grey = room((*lead, *points))
+    return grey, None if source.channels is None else room((*lead, source.count, *points))
+
+
+def _planes(source: SampleBands, slopes: np.ndarray, room: Room) -> tuple[Any, Any, np.ndarray]:
+    """(pictures, the same in colour or None, sharpness) of all planes."""
+    grey, coloured = _room(source, room, STEP, (len(slopes),))
+    square, count = np.zeros((2, len(slopes)))
+    for some in together(source, slopes, STEP):
+        numbers = range(some.start, some.stop)
+        streams = shared(source, len(numbers))
+        planes = [_plane(*both, source) for both in zip(streams, slopes[some])]
+        for rows, parts in zip(_points(source), zip(*planes)):
+            for number, (mean, colours, steep) in zip(numbers, parts):
+                grey[number, rows] = mean
+                if coloured is not None:
+                    coloured[number, :, rows] = colours
+                square[number] += np.nansum(steep)
+                count[number] += np.count_nonzero(np.isfinite(steep))
+    with np.errstate(invalid="ignore"):
+        return grey, coloured, square / count
+
+
+def _plane(
+    bands_of: Parts, slope: float, source: SampleBands
+) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """The mean of a plane's pictures, these (channel, row, column), and the squared gradient of the
+    mean, of each band of the source.
+    """
+    streams = shared(bands_of, source.count)
+    seen = (pictures(stream, source, number, slope) for number, stream in enumerate(streams))
+    parts = (np.stack(channels) for channels in zip(*seen))
+    around = [widened(rows, 1, STEP * source.shape[0]) for rows in _points(source)]
+    for rows, more, part in zip(_points(source), around, windows(parts, around)):
+        own = slice(rows.start - more.start, rows.stop - more.start)
+        mean = known_mean(part, 0)
+        down, right = np.gradient(mean)
+        yield mean[own], part[:, own], (down**2 + right**2)[own]
+
+
+def _in_focus(source: SampleBands, slope: np.ndarray, room: Room) -> tuple[Any, Any]:
+    """The picture in which every lenslet is refocused by its own slope, of a map (row, column), in
+    grey, and in colour or None.
+    """
+    grey, coloured = _room(source, room, STEP)
+    seen = [
+        pictures(stream, source, number, slope)
+        for number, stream in enumerate(shared(source, source.count))
+    ]
+    for rows, parts in zip(_points(source), zip(*seen)):
+        grey[rows] = known_mean(np.stack(parts), 0)
+        if coloured is not None:
+            coloured[:, rows] = np.stack(parts)
+    return grey, coloured
+
+
+def _views(source: SampleBands, count: int, room: Room) -> tuple[Any, Any]:
+    """The views, one value a pitch, in grey, and in colour or None."""
+    grey, coloured = _room(source, room, 1, (count, count))
+    for rows, seen in zip(source.rows, views_in_bands(source, count)):
+        grey[:, :, rows] = known_mean(seen, 2)
+        if coloured is not None:
+            coloured[:, :, :, rows] = seen
+    return grey, coloured
 
 
 def in_metres(depth: DepthMap, optics: Optics | MicroscopeOptics) -> DepthMap:

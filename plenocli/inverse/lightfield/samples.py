@@ -1,14 +1,21 @@
 """What the usable pixels of a capture saw, each from where it stands behind its lenslet."""
 
-from collections.abc import Sequence
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 
+from plenocli.base.errors import InputError
 from plenocli.base.tiling import EVERYTHING, Plane, bands
 
 AT_ONCE = 1 << 18
 """Samples, or pixels for them, that are worked on together: temporary arrays are no larger."""
+TEMPORARY_BYTES = 85
+"""Memory for each of them (measured)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,8 +66,8 @@ class Samples:
         parts = (self.offset[part].astype(float) for part in bands(len(self.offset), AT_ONCE))
         return float(np.sqrt(max((part**2).sum(axis=1).max() for part in parts)))
 
-    def where(self, some: np.ndarray | slice) -> "Samples":
-        """Those of the samples that `some` says, (sample,) bool or a slice."""
+    def where(self, some: np.ndarray | slice) -> Samples:
+        """Those of the samples that `some` says, (sample,) bool, numbers or a slice."""
         channel = None if self.channel is None else self.channel[some]
         return replace(
             self,
@@ -75,6 +82,107 @@ class Samples:
         if self.channels is None or self.channel is None:
             return [slice(None)]
         return [self.channel == number for number in range(len(self.channels.names))]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Survey:
+    """What is known of all samples of a capture.
+
+    reach: farthest usable pixel from its centre, px: half of the pupil's image.
+    each: (channel,) samples of a lenslet that has some, on average.
+    mean, square: (channel,) of their values and the squares of these.
+    """
+
+    reach: float
+    each: np.ndarray
+    mean: np.ndarray
+    square: np.ndarray
+
+
+@dataclass(frozen=True, kw_only=True)
+class SampleBands:
+    """Samples of a capture in bands of lenslets, those of some rows of a picture each, which are
+    made when they are asked for.
+
+    shape: (rows, columns) of a picture, in lenslet pitches.
+    pitch: lenslet spacing, px.
+    channels: None for grey samples.
+    rows: of a picture, of each band; they follow each other. What has its centre beyond the picture
+        is in the first or the last.
+    read: number of a band -> its samples, one part a channel.
+    held: bytes of the images that they are made of, as far as these are in memory.
+    where: the file that messages name.
+    """
+
+    shape: tuple[int, int]
+    pitch: float
+    channels: Channels | None
+    rows: tuple[slice, ...]
+    read: Callable[[int], tuple[Samples, ...]]
+    held: int = 0
+    where: str | Path | None = None
+
+    @classmethod
+    def of(cls, samples: Samples | SampleBands, shape: tuple[int, int]) -> SampleBands:
+        """Those of samples in memory; shape: of a picture. SampleBands are some already."""
+        if isinstance(samples, SampleBands):
+            return samples
+        cell = picture_rows(samples.centres, samples.pitch, shape[0])[samples.lenslet]
+        order = np.argsort(cell, kind="stable")
+        rows = bands(shape[0], int(AT_ONCE * shape[0] / max(len(cell), 1)))
+        ends = np.searchsorted(cell[order], [0, *(part.stop for part in rows)])
+
+        def read(number: int) -> tuple[Samples, ...]:
+            own = samples.where(order[ends[number] : ends[number + 1]])
+            return tuple(
+                replace(own.where(some), channel=None, channels=None) for some in own.parts()
+            )
+
+        return cls(
+            shape=shape,
+            pitch=samples.pitch,
+            channels=samples.channels,
+            rows=tuple(rows),
+            read=read,
+            held=sum(v.nbytes for v in (samples.lenslet, samples.offset, samples.value)),
+        )
+
+    @property
+    def count(self) -> int:
+        """Of the channels, one of grey samples."""
+        return 1 if self.channels is None else len(self.channels.names)
+
+    def __iter__(self) -> Iterator[tuple[Samples, ...]]:
+        return (self.read(number) for number in range(len(self.rows)))
+
+    @cached_property
+    def survey(self) -> Survey:
+        """What all bands come to. Raises InputError where no pixel is lit."""
+        farthest, sums = 0.0, np.zeros((self.count, 4))
+        for parts in self:
+            for total, part in zip(sums, parts):
+                if len(part.value):
+                    farthest = max(farthest, part.reach())
+                    lit = np.count_nonzero(np.bincount(part.lenslet))
+                    value = part.value.astype(float)
+                    total += np.array([len(value), lit, value.sum(), (value**2).sum()])
+        if not sums[:, 0].any():
+            raise unlit(self.where)
+        number, lenslets, total, square = np.maximum(sums, [1, 1, -np.inf, 0]).T
+        return Survey(
+            reach=farthest, each=number / lenslets, mean=total / number, square=square / number
+        )
+
+
+def unlit(where: str | Path | None) -> InputError:
+    """The error of a capture of which no pixel is lit; where: its file."""
+    fix = "check the white image and the calibration"
+    return InputError("has no lit superpixel on the grid", where, fix)
+
+
+def picture_rows(centres: np.ndarray, pitch: float, count: int) -> np.ndarray:
+    """(lenslet,) row of a picture, of `count`, in which each centre (lenslet, 2) px lies."""
+    return np.clip(np.floor(centres[:, 0] / pitch).astype(int), 0, count - 1)
 
 
 def joined(parts: Sequence[Samples], channels: Channels | None = None) -> Samples:
@@ -105,52 +213,41 @@ def collect(
 ) -> Samples:
     """Grey samples of a mosaic.
 
-    signal, white: (row, column), dark taken off; white is 0 where a pixel does not count. Bands of
-        Planes are read one after the other.
-    centres: (lenslet_row, lenslet_column, 2) px, row and column.
-    valid: (lenslet_row, lenslet_column) bool.
+    signal, white: (row, column), dark taken off; white is 0 where a pixel does not count. Of Planes
+        the rows of these lenslets are read.
+    centres: (..., 2) px, row and column, of lenslets.
+    valid: (...) bool.
     pitch: lenslet spacing, px.
     threshold: a pixel counts where white is above this share of the brightest of its superpixel,
         and within half a pitch.
     """
-    parts = bands(len(centres), int(AT_ONCE / (centres.shape[1] * pitch**2)))
-    if len(parts) > 1:
-        return joined(
-            [collect(signal, white, centres[r], valid[r], pitch, threshold) for r in parts]
-        )
+    found = centres[valid]
     half = int(pitch // 2)
     steps = np.arange(-half, half + 1)
-    near = np.rint(np.where(np.isfinite(centres), centres, -1e6)).astype(int)
-    there = near[valid, 0] if valid.any() else np.zeros(1, int)
-    top, bottom = (int(n) for n in np.clip([there.min() - half, there.max() + half + 1], 0, None))
-    band = slice(top, bottom)
-    signal, white = (Plane.of(whole).read(band, EVERYTHING) for whole in (signal, white))
-    near = near - (top, 0)
-    rows, columns = (
-        near[..., axis, None, None] + step
-        for axis, step in enumerate(np.meshgrid(steps, steps, indexing="ij"))
-    )
-    inside = (
-        (rows >= 0)
-        & (rows < signal.shape[0])
-        & (columns >= 0)
-        & (columns < signal.shape[1])
-        & valid[..., None, None]
-    )
-    rows, columns = np.where(inside, rows, 0), np.where(inside, columns, 0)
-    level = np.where(inside, white[rows, columns], 0.0)
-    offset = np.stack([rows, columns], axis=-1) - (centres - (top, 0))[:, :, None, None, :]
-    used = (
-        inside
-        & (level > threshold * level.max(axis=(2, 3), keepdims=True))
-        & (np.abs(offset).max(axis=-1) <= pitch / 2)
-        & np.isfinite(signal[rows, columns])
-    )
-    number = np.arange(valid.size, dtype=np.int32).reshape(*valid.shape, 1, 1)
+    near = np.rint(found).astype(int)
+    whole = Plane.of(signal)
+    ends = near[:, 0].min(initial=whole.shape[0]) - half, near[:, 0].max(initial=0) + half + 1
+    top, bottom = (int(n) for n in np.clip(ends, 0, whole.shape[0]))
+    signal, white = (Plane.of(p).read(slice(top, bottom), EVERYTHING) for p in (whole, white))
+    sides, near = np.array([bottom - top, whole.shape[1]]), near - (top, 0)
+    at = near[:, :, None] + steps  # (lenslet, axis, step)
+    away = at - (found - (top, 0))[:, :, None]
+    inside = (at >= 0) & (at < sides[:, None])
+    at = np.clip(at, 0, np.maximum(sides - 1, 0)[:, None])
+    index = at[:, 0, :, None] * whole.shape[1] + at[:, 1, None, :]
+    level = np.asarray(white).ravel()[index] if index.size else np.zeros(index.shape)
+    if not inside.all():
+        level = np.where(inside[:, 0, :, None] & inside[:, 1, None, :], level, 0.0)
+    inside &= np.abs(away) <= pitch / 2
+    used = level > threshold * level.max(axis=(1, 2), keepdims=True)
+    used &= inside[:, 0, :, None] & inside[:, 1, None, :]
+    seen = np.asarray(signal).ravel()[index[used]]
+    finite = np.isfinite(seen)
+    lenslet, row, column = (numbers[finite] for numbers in np.nonzero(used))
     return Samples(
-        centres=centres.reshape(-1, 2),
-        lenslet=np.broadcast_to(number, used.shape)[used],
-        offset=offset[used].astype(np.float32),
-        value=(signal[rows[used], columns[used]] / level[used]).astype(np.float32),
+        centres=found,
+        lenslet=lenslet.astype(np.int32),
+        offset=np.stack([away[lenslet, 0, row], away[lenslet, 1, column]], -1).astype(np.float32),
+        value=(seen[finite] / level[used][finite]).astype(np.float32),
         pitch=float(pitch),
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -20,7 +20,10 @@ if TYPE_CHECKING:
     from plenocli.execution.batch import BatchSummary
     from plenocli.inverse.lightfield.optics import MicroscopeOptics, Optics
     from plenocli.inverse.lightfield.planes import DepthMap, LightField
-    from plenocli.inverse.lightfield.samples import Samples
+    from plenocli.inverse.lightfield.samples import SampleBands
+
+COPIES = {".h5": 0, ".tif": 2, ".tiff": 2, ".exr": 7}
+"""How often all pictures are in memory while a file of a suffix is written (measured)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,7 +116,8 @@ def run_refocus(
         return summarise(batch, ())
     optics = None if settings.camera is None else _optics(settings.camera)
     tried = _slopes(settings, optics)
-    work = partial(_refocused, settings=settings, optics=optics, tried=tried)
+    targets = dict(batch.todo)
+    work = partial(_refocused, targets=targets, settings=settings, optics=optics, tried=tried)
     write = partial(_write, settings=settings, overwrite=overwrite, command=command)
     with (
         one_thread(),
@@ -135,21 +139,35 @@ def _optics(camera: Path) -> Optics | MicroscopeOptics:
 def _refocused(
     capture: Path,
     *,
+    targets: Mapping[Path, Path],
     settings: Settings,
     optics: Optics | MicroscopeOptics | None,
     tried: np.ndarray,
-) -> tuple[LightField, Samples, tuple[int, int]]:
-    """The light field of one capture, what it was made from, and its lenslets."""
-    from plenocli.inverse.lightfield.light_field import WIDER, refocused
+) -> tuple[LightField, SampleBands]:
+    """The light field of one capture, and what it was made from. What becomes an artefact is kept
+    beside it meanwhile.
+    """
+    from plenocli.files.scratch import Scratch
+    from plenocli.inverse.lightfield.light_field import in_memory, refocused
 
-    grow = not (settings.slopes or settings.distances)
-    samples, shape = _samples(capture, settings.calibration, len(tried) * (WIDER if grow else 1))
-    field = refocused(samples, shape, tried, views=settings.views, optics=optics, grow=grow)
-    return field, samples, shape
+    target = targets[capture]
+    source = _source(capture, settings.calibration)
+    return (
+        refocused(
+            source,
+            tried,
+            views=settings.views,
+            optics=optics,
+            grow=not (settings.slopes or settings.distances),
+            room=Scratch(target) if target.suffix == ".h5" else in_memory,
+            copies=COPIES[target.suffix],
+        ),
+        source,
+    )
 
 
 def _write(
-    done: tuple[LightField, Samples, tuple[int, int]],
+    done: tuple[LightField, SampleBands],
     capture: Path,
     target: Path,
     *,
@@ -161,12 +179,12 @@ def _write(
     from plenocli.files.artefacts.provenance import Provenance, describe_inputs
     from plenocli.files.results.lightfields import write_lightfield
 
-    field, samples, shape = done
+    field, source = done
     inputs = describe_inputs(
         {"capture": capture, "calibration": settings.calibration, "camera": settings.camera}
     )
     provenance = Provenance(command=command, inputs=inputs, seed=0)
-    write_lightfield(target, field, samples, provenance, overwrite=overwrite)
+    write_lightfield(target, field, source, provenance, overwrite=overwrite)
     known, beyond = _told(field.depth, field.slopes)
     best = int(np.argmax(field.sharpness))
     distance = np.nan if field.distances is None else float(field.distances[best])
@@ -174,7 +192,7 @@ def _write(
         capture=str(capture),
         output=str(target),
         planes=len(field.slopes),
-        lenslets=list(shape),
+        lenslets=list(source.shape),
         channels=[] if field.colours is None else list(field.colours.channels.names),
         sharpest_slope=float(field.slopes[best]),
         slopes=field.slopes.tolist(),
@@ -185,15 +203,14 @@ def _write(
     )
 
 
-def _samples(
-    capture: Path, calibration: Path | None, planes: int
-) -> tuple[Samples, tuple[int, int]]:
-    """Samples of a capture, or of spectra that demux made of one, and the shape of a picture."""
+def _source(capture: Path, calibration: Path | None) -> SampleBands:
+    """Samples of a capture, or of spectra that demux made of one."""
     from plenocli.files.images.mosaic import capture_in_file
     from plenocli.files.opened_file import open_file
-    from plenocli.files.read.calibrations import read_calibration
+    from plenocli.files.read.calibrations import read_calibration, read_images
     from plenocli.files.results.results import read_result
-    from plenocli.inverse.lightfield.gather import samples_of, samples_of_spectra
+    from plenocli.inverse.lightfield.gather import bands_of, samples_of_spectra
+    from plenocli.inverse.lightfield.samples import SampleBands
 
     if open_file(capture).kind == "spectra":
         if calibration is None:
@@ -206,9 +223,11 @@ def _samples(
         spectra = read_result(capture, ("spectra",))
         assert spectra.wavelengths is not None
         known = read_calibration(calibration)
-        return samples_of_spectra(spectra.values, spectra.wavelengths, known, where=calibration)
-    found = None if calibration is None else read_calibration(calibration, response=False)
-    return samples_of(capture_in_file(capture), found, planes=planes, where=calibration)
+        return SampleBands.of(
+            *samples_of_spectra(spectra.values, spectra.wavelengths, known, where=calibration)
+        )
+    found = None if calibration is None else read_images(calibration)
+    return bands_of(capture_in_file(capture, small=False), found, where=calibration)
 
 
 def _told(depth: DepthMap | None, slopes: np.ndarray) -> tuple[float | None, float | None]:

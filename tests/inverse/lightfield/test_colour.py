@@ -9,10 +9,11 @@ from plenocli.forward.sensor.capture import Capture, SuperpixelGrid
 from plenocli.forward.sensor.cfa import ColourProfile, cfa_map, colour_planes, preview
 from plenocli.inverse.calibration.calibration import Calibration, Response, Sensor, White, Windows
 from plenocli.inverse.lightfield.depth import depth
-from plenocli.inverse.lightfield.gather import samples_of, samples_of_spectra
+from plenocli.inverse.lightfield.gather import bands_of, samples_of, samples_of_spectra
 from plenocli.inverse.lightfield.light_field import refocused
 from plenocli.inverse.lightfield.planes import slope_of
 from plenocli.inverse.lightfield.refocus import STEP
+from plenocli.inverse.lightfield.samples import SampleBands
 from tests.reference.calibrations import lenslet_grid
 
 FOCAL, IMAGE, GAP, COUNT = 0.05, 0.055, 0.5e-3, 25
@@ -53,8 +54,7 @@ def known_camera(pixels, cfa, white, **more):
 
 def chain(mosaic, pixels, cfa, white, slopes):
     camera = known_camera(pixels, cfa, white)
-    samples, shape = samples_of(Capture(mosaic=mosaic, cfa=cfa), camera)
-    return refocused(samples, shape, slopes, views=3)
+    return refocused(bands_of(Capture(mosaic=mosaic, cfa=cfa), camera), slopes, views=3)
 
 
 @pytest.mark.parametrize("pixels, cfa", [(11, "RGGB"), (12, "GBRG"), (14, "BGGR")])
@@ -104,10 +104,10 @@ def test_depth_of_a_colour_mosaic_is_that_of_the_plane(distance):
     own = np.stack([cfa_map(light.shape[:2], "RGGB") == c for c in "RGB"], axis=-1)
     mosaic = (light * gains * own).sum(-1)
     mosaic = mosaic + 0.003 * np.random.default_rng(1).normal(size=mosaic.shape)
-    samples, shape = samples_of(
+    source = bands_of(
         Capture(mosaic=mosaic, cfa="RGGB"), known_camera(pixels, "RGGB", (own * gains).sum(-1))
     )
-    found = depth(samples, np.linspace(-4, 4, 17), shape).slope[4:-4, 4:-4]
+    found = depth(source, np.linspace(-4, 4, 17)).slope[4:-4, 4:-4]
     assert np.isfinite(found).mean() > 0.8
     assert np.nanpercentile(np.abs(found - slope), 90) < 0.3
 
@@ -136,7 +136,7 @@ def test_bands_of_spectra_meet_in_their_plane_and_tell_its_depth(slope):
         own.append((1 - band / 3) * picture[..., 2] + band / 3 * picture[..., 0])
     values = np.array(own) + 0.002 * np.random.default_rng(2).normal(size=(count, COUNT, COUNT))
     samples, shape = samples_of_spectra(values, bands, camera)
-    field = refocused(samples, shape, np.linspace(-4, 4, 17), views=2)
+    field = refocused(SampleBands.of(samples, shape), np.linspace(-4, 4, 17), views=2)
     assert field.colours.channels.names == ("450 nm", "540 nm", "570 nm", "650 nm")
     inner, sure = field.depth.slope[4:-4, 4:-4], field.depth.confidence[4:-4, 4:-4] > 0.5
     assert sure.mean() > 0.5 and np.abs(np.median(inner[sure]) - slope) < 0.15

@@ -10,10 +10,13 @@ from scipy.ndimage import map_coordinates
 
 import plenocli.inverse.lightfield.depth as depth
 import plenocli.inverse.lightfield.gather as gather
-import plenocli.inverse.lightfield.refocus as refocus
 import plenocli.inverse.lightfield.samples as samples
+from plenocli.base.budget import Budget, within
+from plenocli.base.errors import NumericsError
 from plenocli.base.tiling import Plane
+from plenocli.files.scratch import Scratch
 from plenocli.forward.sensor.capture import Capture, Levels, SuperpixelGrid
+from plenocli.inverse.calibration.calibration import Calibration, Sensor, White
 from plenocli.inverse.lightfield.light_field import refocused
 from tests.reference.calibrations import drawn_calibration, lenslet_grid
 
@@ -66,11 +69,10 @@ def scene(kind, cfa, rng):
 
 @pytest.mark.parametrize("kind", ["tiles", "grid"])
 @pytest.mark.parametrize("cfa", ["mono", "GRBG"])
-def test_bands_give_what_one_piece_gives(monkeypatch, kind, cfa):
+def test_bands_give_what_one_piece_gives(monkeypatch, tmp_path, kind, cfa):
     shot, calibration = scene(kind, cfa, np.random.default_rng(3))
     slopes = np.linspace(-1.5, 1.5, 7)
-    made, shape = gather.samples_of(shot, calibration)
-    whole = refocused(made, shape, slopes, views=2)
+    whole = refocused(gather.bands_of(shot, calibration), slopes, views=2)
     read = []
 
     def window(rows, columns):
@@ -78,22 +80,54 @@ def test_bands_give_what_one_piece_gives(monkeypatch, kind, cfa):
         read.append(len(part))
         return part
 
-    for module in (depth, gather, refocus, samples):
+    monkeypatch.setattr(depth, "TOGETHER", (1, 1))
+    for module in (gather, samples):
         monkeypatch.setattr(module, "AT_ONCE", 3 * PITCH**2 * COLUMNS // 2)
     stored = replace(shot, mosaic=Plane(shot.shape, window))
-    made, shape = gather.samples_of(stored, calibration)
-    assert len(read) > ROWS / 2 and min(read) < 5 * PITCH
-    parts = refocused(made, shape, slopes, views=2)
+    source = gather.bands_of(stored, calibration)
+    parts = refocused(source, slopes, views=2, room=Scratch(tmp_path / "out.h5"), copies=0)
+    assert not list(tmp_path.iterdir())
+    assert len(source.rows) > ROWS / 2 and len(read) > ROWS and min(read) < 5 * PITCH
     assert np.nanmedian(parts.depth.slope) == pytest.approx(0.5, abs=0.15)
     for ours, theirs in (
-        (parts.pictures, whole.pictures),
+        (parts.pictures.whole(), whole.pictures),
         (parts.sharpness, whole.sharpness),
-        (parts.views, whole.views),
-        (parts.sharp, whole.sharp),
+        (parts.views.whole(), whole.views),
+        (parts.sharp.whole(), whole.sharp),
         (parts.depth.slope, whole.depth.slope),
         (parts.depth.confidence, whole.depth.confidence),
         (parts.depth.sigma, whole.depth.sigma),
         (parts.depth.edge, whole.depth.edge),
-        *([] if cfa == "mono" else [(parts.colours.pictures, whole.colours.pictures)]),
+        *(
+            (getattr(parts.colours, name).whole(), getattr(whole.colours, name))
+            for name in ("pictures", "sharp", "views")
+            if cfa != "mono"
+        ),
     ):
         np.testing.assert_allclose(ours, theirs, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("in_file, words", [(True, "cut the capture"), (False, "take an .h5")])
+def test_what_does_not_fit_is_refused_before_a_pixel_is_read(tmp_path, in_file, words):
+    """A sensor of a million lenslets: in a file its pictures need a fraction of what they hold."""
+    shape = 2400, 2400
+
+    def unread(rows, columns):
+        raise AssertionError("a pixel was asked for")
+
+    centres = np.stack(np.meshgrid(*2 * [np.arange(600) * 4 + 1.5], indexing="ij"), axis=-1)
+    white = Plane(shape, unread)
+    calibration = Calibration(
+        grid=lenslet_grid(centres, 4 * np.eye(2)),
+        sensor=Sensor(cfa="mono"),
+        white=White(level=None, flat=white),
+    )
+    source = gather.bands_of(Capture(mosaic=Plane(shape, unread)), calibration)
+    room = {"room": Scratch(tmp_path / "out.h5"), "copies": 0} if in_file else {}
+    with (
+        within(Budget(30 << 20 if in_file else 300 << 20)),
+        pytest.raises(NumericsError, match=f"refocusing needs about .*{words}"),
+    ):
+        refocused(source, np.linspace(-3, 3, 13), **room)
+    with within(Budget(300 << 20)), pytest.raises(AssertionError, match="asked for"):
+        refocused(source, np.linspace(-3, 3, 13), room=Scratch(tmp_path / "out.h5"), copies=0)

@@ -4,13 +4,12 @@ import numpy as np
 import pytest
 
 from plenocli.inverse.lightfield import depth as depth_module
-from plenocli.inverse.lightfield import refocus as refocus_module
 from plenocli.inverse.lightfield import samples as samples_module
 from plenocli.inverse.lightfield.depth import depth
 from plenocli.inverse.lightfield.light_field import refocused, usual_slopes
 from plenocli.inverse.lightfield.planes import distance_of, slope_of
 from plenocli.inverse.lightfield.refocus import STEP, refocus, views
-from plenocli.inverse.lightfield.samples import collect
+from plenocli.inverse.lightfield.samples import SampleBands, collect
 
 FOCAL, IMAGE, GAP, PITCH_PX, COUNT = 0.05, 0.055, 0.5e-3, 11, 25
 PITCH = 55e-6  # of the lenslets, m
@@ -117,7 +116,7 @@ def _parts(found):
 def test_depth_of_two_halves_is_found_within_a_fraction_of_the_geometric_limit(noise, far, near):
     """The limit: a lenslet of parallax across the pupil is a slope of one."""
     made = samples(capture(far, near), noise)
-    found, confidence = _parts(depth(made, np.linspace(-4, 4, 33), (COUNT, COUNT)))
+    found, confidence = _parts(depth(SampleBands.of(made, (COUNT, COUNT)), np.linspace(-4, 4, 33)))
     inner = confidence[4:-4, 4:-4] > 0.5
     left, right = found[4:-4, 4:10], found[4:-4, 15:-4]
     sure_left, sure_right = inner[:, :6], inner[:, 11:]
@@ -136,7 +135,7 @@ def test_depth_of_two_halves_is_found_within_a_fraction_of_the_geometric_limit(n
 
 def test_a_scene_without_texture_has_no_depth_and_no_confidence():
     made = samples(np.full((COUNT * PITCH_PX,) * 2, 0.4))
-    found, confidence = _parts(depth(made, np.linspace(-2, 2, 9), (COUNT, COUNT)))
+    found, confidence = _parts(depth(SampleBands.of(made, (COUNT, COUNT)), np.linspace(-2, 2, 9)))
     assert confidence.max() == 0 and np.isnan(found).all()
     picture, spread = refocus(made, 1.3, (COUNT, COUNT))
     assert np.nanmax(np.abs(picture - 0.4)) < 1e-7 and np.nanmax(spread) < 1e-12
@@ -145,7 +144,7 @@ def test_a_scene_without_texture_has_no_depth_and_no_confidence():
 @pytest.mark.parametrize("distance", [0.42, 0.45, 0.7, 0.8])
 def test_a_plane_beyond_the_usual_range_is_found_and_no_lenslet_is_sure_at_an_edge(distance):
     made = samples(capture(distance), 0.01)
-    field = refocused(made, (COUNT, COUNT), usual_slopes(7), views=0, grow=True)
+    field = refocused(SampleBands.of(made, (COUNT, COUNT)), usual_slopes(7), views=0, grow=True)
     found, confidence = _parts(field.depth)
     off = np.abs(found - slope(distance))
     sure = confidence >= 0.4
@@ -157,7 +156,7 @@ def test_a_plane_beyond_the_usual_range_is_found_and_no_lenslet_is_sure_at_an_ed
 
 def test_both_halves_of_a_scene_are_sharp_in_the_picture_by_its_depths():
     made = samples(capture(0.65, 0.48))
-    field = refocused(made, (COUNT, COUNT), usual_slopes(13), views=0, grow=True)
+    field = refocused(SampleBands.of(made, (COUNT, COUNT)), usual_slopes(13), views=0, grow=True)
     at = (np.arange(COUNT * STEP) / STEP * PITCH_PX - (COUNT * PITCH_PX - 1) / 2) / PITCH_PX
     true = scene(*np.meshgrid(at, at, indexing="ij")[::-1])
     inner = slice(5 * STEP, -5 * STEP)
@@ -170,7 +169,7 @@ def test_both_halves_of_a_scene_are_sharp_in_the_picture_by_its_depths():
 
 def test_beyond_slopes_that_do_not_grow_nothing_is_known():
     """The plane stands at a slope of 3.4."""
-    found = depth(samples(capture(0.42)), np.linspace(-2, 2, 9), (COUNT, COUNT))
+    found = depth(SampleBands.of(samples(capture(0.42)), (COUNT, COUNT)), np.linspace(-2, 2, 9))
     assert found.beyond > 0.9 and np.isnan(found.slope).mean() > 0.9
     assert (found.confidence[np.isnan(found.slope)] == 0).all()
 
@@ -222,7 +221,9 @@ def test_confidence_is_how_often_the_slope_is_right_and_sigma_how_far_it_is_off(
 
         distances = distance_of(np.array([far, near]), FOCAL, IMAGE, GAP)
         made = samples(capture(distances[0], distances[1], texture), noise)
-        field = refocused(made, (COUNT, COUNT), usual_slopes(13), views=0, grow=True)
+        field = refocused(
+            SampleBands.of(made, (COUNT, COUNT)), usual_slopes(13), views=0, grow=True
+        )
         column = np.arange(COUNT) - (COUNT - 1) / 2
         true = np.where(column > 0, near, far) * np.ones((COUNT, 1))
         inner = (slice(2, -2), slice(2, -2))
@@ -245,11 +246,11 @@ def test_confidence_is_how_often_the_slope_is_right_and_sigma_how_far_it_is_off(
 def test_how_many_samples_are_worked_on_together_changes_nothing(monkeypatch):
     mosaic = capture(0.62, 0.5)
     whole = samples(mosaic)
-    map_of_all = depth(whole, usual_slopes(7).tolist(), (COUNT, COUNT))
-    for module in (depth_module, refocus_module, samples_module):
+    map_of_all = depth(SampleBands.of(whole, (COUNT, COUNT)), usual_slopes(7).tolist())
+    for module in (depth_module, samples_module):
         monkeypatch.setattr(module, "AT_ONCE", 3001)
     parts = samples(mosaic)
     for name in ("centre", "offset", "value"):
         np.testing.assert_array_equal(getattr(parts, name), getattr(whole, name))
-    found = depth(parts, usual_slopes(7).tolist(), (COUNT, COUNT))
+    found = depth(SampleBands.of(parts, (COUNT, COUNT)), usual_slopes(7).tolist())
     np.testing.assert_allclose(found.slope, map_of_all.slope, atol=1e-5)

@@ -295,13 +295,8 @@ class LatticeSystem:
         """A^T V^-1 A and the prior's precision: (len(rows), len(columns), unknown, unknown)."""
         out = acts.conj() @ acts.swapaxes(-1, -2)
         if self.prior is not None:
-            before = self.prior.precision(rows, columns).astype(out.dtype)
-            each = self.prior.inverse.astype(out.real.dtype)
-            modes, bands = before.shape[-1], len(each)
-            by_band = out.reshape(*out.shape[:2], modes, bands, modes, bands)
-            for k, line in enumerate(each):
-                for other, amount in enumerate(line):
-                    by_band[..., k, :, other] += amount * before
+            before = self.prior.precision(rows, columns)
+            out += np.kron(before, self.prior.inverse).astype(out.dtype)
         return out
 
     @cached_property

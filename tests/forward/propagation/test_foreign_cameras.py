@@ -1,10 +1,12 @@
 """Cameras that nobody tuned anything on: what is asked for holds, or is refused with a number."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from plenocli.forward.propagation.system_matrix import build_pif
 from tests.forward.propagation import foreign
 from tests.forward.propagation.cameras import plan_pif, small_camera, system_matrix
 from tests.reference import tensor
@@ -63,6 +65,24 @@ def test_answers_off_the_axis_that_missed_hold(count):
 def test_a_sample_of_harmonics_holds(count, without_openings):
     cases = [foreign.answer(41, n, "auto") for n in CENTRED]
     assert all(c.rung == "exact, harmonics" for c in summed(cases, count))
+
+
+def test_factors_that_lie_column_by_column_are_shown_on_pixels():
+    """Ended in exit 70: lenslets joined on one superpixel, each of few terms. Fields on the nodes of
+    pixels themselves are the oracle.
+    """
+    camera, request = foreign.case(7806, 222, "exact")
+    request |= {"superpixels": (1, 1), "coherent_ring": 1}
+    plan = plan_pif(camera, **request)
+    (band,) = plan.bands
+    assert plan.rung == "exact, low rank" and band.sensor_count
+    on_nodes = replace(plan, bands=(replace(band, sensor_count=0),))
+    found, nodes = (
+        build_pif(camera, one).A[0].reshape(-1, int(np.prod(camera.object.samples_per_lenslet)))
+        for one in (plan, on_nodes)
+    )
+    error = np.linalg.norm(found - nodes, axis=0) / np.linalg.norm(nodes, axis=0)
+    assert error.max() <= request["accuracy"]
 
 
 @pytest.mark.slow

@@ -172,6 +172,8 @@ class Interval:
         if modes is None:
             return factor
         real, shape = factor.real.dtype, (self.side.lines, -1)
+        # singular vectors may lie column by column
+        factor = np.ascontiguousarray(factor)
         wide = modes.shown.astype(real) @ factor.reshape(shape).view(real)
         wide = wide.view(factor.dtype)
         apart = self._from_middle(modes.pixels, other) - self._own_path(modes.pixels)

@@ -68,8 +68,8 @@ def test_a_sample_of_harmonics_holds(count, without_openings):
 
 
 def test_factors_that_lie_column_by_column_are_shown_on_pixels():
-    """Ended in exit 70: lenslets joined on one superpixel, each of few terms. Fields on the nodes of
-    pixels themselves are the oracle.
+    """Ended in exit 70: lenslets joined on one superpixel, each of few terms. Fields on the nodes
+    of pixels themselves are the oracle.
     """
     camera, request = foreign.case(7806, 222, "exact")
     request |= {"superpixels": (1, 1), "coherent_ring": 1}
@@ -77,10 +77,8 @@ def test_factors_that_lie_column_by_column_are_shown_on_pixels():
     (band,) = plan.bands
     assert plan.rung == "exact, low rank" and band.sensor_count
     on_nodes = replace(plan, bands=(replace(band, sensor_count=0),))
-    found, nodes = (
-        build_pif(camera, one).A[0].reshape(-1, int(np.prod(camera.object.samples_per_lenslet)))
-        for one in (plan, on_nodes)
-    )
+    points = math.prod(camera.object.samples_per_lenslet)
+    found, nodes = (build_pif(camera, one).A[0].reshape(-1, points) for one in (plan, on_nodes))
     error = np.linalg.norm(found - nodes, axis=0) / np.linalg.norm(nodes, axis=0)
     assert error.max() <= request["accuracy"]
 

@@ -18,7 +18,6 @@ from plenocli.forward.propagation.fresnel.trial_columns import (
     Trial,
     TrialColumns,
     trial_columns,
-    tried_by,
 )
 
 if TYPE_CHECKING:
@@ -30,20 +29,19 @@ CUTS = 1e-8, 1e-7
 
 
 class ExactTrial(Trial):
-    """A Trial by the exact model, of lenslets on the axis."""
+    """A Trial by the exact model."""
 
     @property
     def cost(self) -> float:
         """As of Trial: each term of the kernel is twice as much as the paraxial model."""
-        g = replace(self.geometry, chief=(0.0, 0.0))
-        return 2 * super().cost * len(residual_of(g, offset_of(g, (0, 0), (0, 0)), CUTS[1]).core)
+        own = offset_of(self.geometry, (0, 0), (0, 0))
+        return 2 * super().cost * len(residual_of(self.geometry, own, CUTS[1]).core)
 
     def fields(
         self, camera: Camera, points: list[tuple[int, int]]
     ) -> Iterator[tuple[int, np.ndarray]]:
         """As of Trial."""
-        g = replace(self.geometry, chief=(0.0, 0.0))
-        behind = OpenFields(camera, g, self.half, CUTS, self.window, np.dtype(complex))
+        behind = OpenFields(camera, self.geometry, self.half, CUTS, self.window, np.dtype(complex))
         rows, columns = np.array(points).T
         for place in self.places:
             nodes = [self.nodes(axis, at) for axis, at in enumerate(place)]
@@ -63,7 +61,8 @@ def exact_trial_columns(
     """As trial_columns, by the exact model where it tries all columns in time; else what both the
     paraxial model of more of them, and of neighbours that join, and the exact one ask for.
     """
-    exact = tried_by(ExactTrial, camera, geometry, grid, None, symmetric)
+    on_axis = replace(geometry, chief=(0.0, 0.0))
+    exact = trial_columns(camera, on_axis, grid, None, symmetric, ExactTrial)
     if window is None and exact and exact.whole:
         return exact
     paraxial = trial_columns(camera, geometry, grid, window, symmetric)

@@ -96,29 +96,19 @@ def trial_columns(
     grid: tuple[int, int],
     window: int | None,
     symmetric: bool,
+    kind: Callable[..., Trial] | None = None,
 ) -> TrialColumns | None:
-    """The TrialColumns of a camera by the paraxial model, None where they would take too long.
+    """The TrialColumns of a camera, None where they would take too long.
 
     camera: at the wavelength of `geometry`;
     grid: (rows, columns) of superpixels kept;
     window: coherent lenslets on either side, None for isolated ones;
-    symmetric: whether pupil and wavefront are mirrored by both axes.
+    symmetric: whether pupil and wavefront are mirrored by both axes;
+    kind: of trial; None: by the paraxial model.
     """
-    return tried_by(Trial, camera, geometry, grid, window, symmetric)
-
-
-def tried_by(
-    kind: Callable[..., Trial],
-    camera: Camera,
-    geometry: Geometry,
-    grid: tuple[int, int],
-    window: int | None,
-    symmetric: bool,
-) -> TrialColumns | None:
-    """As trial_columns, by another kind of trial."""
     if window is not None:
         window = min(window, math.ceil(geometry.blur / (2 * geometry.D2)) + NEAR)
-    return _tried(kind, _Hashed(camera), geometry, grid, window, symmetric)
+    return _tried(kind or Trial, _Hashed(camera), geometry, grid, window, symmetric)
 
 
 def cut_field(

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from typing import Any, TypeVar
@@ -164,6 +164,19 @@ def windows(blocks: Iterable[np.ndarray], wanted: Iterable[slice]) -> Iterator[n
             parts.append(next(coming))
         held = parts[0] if len(parts) == 1 else np.concatenate(parts, axis=-2)
         yield held[..., rows.start - top : rows.stop - top, :]
+
+
+def around(
+    blocks: Iterable[np.ndarray], own: Sequence[slice], reach: int
+) -> Iterator[tuple[slice, np.ndarray]]:
+    """Bands of what comes in blocks of rows, as `windows`, with `reach` rows more on either side as
+    far as there are any; and which rows of these are the band's own.
+
+    own: rows of each band; they follow each other from the first row to the last.
+    """
+    wide = [widened(rows, reach, own[-1].stop) for rows in own]
+    for rows, more, part in zip(own, wide, windows(blocks, wide)):
+        yield slice(rows.start - more.start, rows.stop - more.start), part
 
 
 def shared(items: Iterable[T], count: int) -> list[Iterator[T]]:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from plenocli.base.budget import budget
-from plenocli.base.tiling import bands, shared, widened, windows
+from plenocli.base.tiling import around, bands, shared
 from plenocli.inverse.lightfield.planes import DepthMap
 from plenocli.inverse.lightfield.refocus import STEP, Parts, displacement, pictures, place
 from plenocli.inverse.lightfield.samples import AT_ONCE, SampleBands
@@ -327,9 +327,7 @@ def _around(
     which rows of these are theirs.
     """
     own = [slice(2 * rows.start, 2 * rows.stop) for rows in _coarse(source, width)]
-    around = [widened(rows, int(8 * width + 0.5), 2 * source.shape[0]) for rows in own]
-    for rows, more, part in zip(own, around, windows(parts, around)):
-        yield slice(rows.start - more.start, rows.stop - more.start), part
+    return around(parts, own, int(8 * width + 0.5))
 
 
 def _variance(
@@ -338,13 +336,11 @@ def _variance(
     """Variance of what meets a point of a plane, two points a pitch, beyond that of the picture's
     own slant, of one channel.
     """
-    own = [slice(2 * rows.start, 2 * rows.stop) for rows in source.rows]
-    around = [widened(rows, 1, 2 * source.shape[0]) for rows in own]
     parts = pictures(bands_of, source, number, slope, 2, squares=True)
-    for rows, more, (picture, variance) in zip(own, around, windows(parts, around)):
+    for own, (picture, variance) in around(parts, source.points(2), 1):
         for part in np.gradient(picture):
             variance = variance - (2 * part) ** 2 / 6  # a tent of a pitch to each side has 1/6
-        yield variance[rows.start - more.start : rows.stop - more.start]
+        yield variance[own]
 
 
 def _smooth(values: np.ndarray, known: np.ndarray, width: float) -> np.ndarray:
@@ -425,19 +421,15 @@ def _slants(
 
     now, late = shared(bands_of, 2)
     reach = displacement(source, slope, STEP) + 2
-    around = [
-        widened(slice(STEP * rows.start, STEP * rows.stop), reach, STEP * source.shape[0])
-        for rows in source.rows
-    ]
-    parts = windows(pictures(now, source, number, slope), around)
-    for rows, more, picture, samples in zip(source.rows, around, parts, late):
+    parts = around(pictures(now, source, number, slope), source.points(STEP), reach)
+    for rows, (own, picture), samples in zip(source.rows, parts, late):
         part = samples[number]
         shape = rows.stop - rows.start, source.shape[1]
         if not len(part.value):
             yield np.zeros((2, *shape))
             continue
         picture = np.where(np.isfinite(picture), picture, source.survey.mean[number])
-        where = np.stack(place(part, slope, STEP)) - [[more.start], [0]]
+        where = np.stack(place(part, slope, STEP)) - [[STEP * rows.start - own.start], [0]]
         value, down, right = (
             map_coordinates(layer, where, order=1, mode="nearest")
             for layer in (picture, *np.gradient(picture))

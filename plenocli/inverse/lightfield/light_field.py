@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from plenocli.base.budget import budget
-from plenocli.base.tiling import shared, widened, windows
+from plenocli.base.tiling import around, shared
 from plenocli.inverse.lightfield.depth import (
     depth,
     depth_in_reach,
@@ -121,11 +121,6 @@ def _require(
     budget().require(needed, "refocusing", source.where, fewer)
 
 
-def _points(source: SampleBands, step: int = STEP) -> list[slice]:
-    """Rows of a picture of each band."""
-    return [slice(step * rows.start, step * rows.stop) for rows in source.rows]
-
-
 def _room(
     source: SampleBands, room: Room, step: int, lead: tuple[int, ...] = ()
 ) -> tuple[Any, Any]:
@@ -143,7 +138,7 @@ def _planes(source: SampleBands, slopes: np.ndarray, room: Room) -> tuple[Any, A
         numbers = range(some.start, some.stop)
         streams = shared(source, len(numbers))
         planes = [_plane(*both, source) for both in zip(streams, slopes[some])]
-        for rows, parts in zip(_points(source), zip(*planes)):
+        for rows, parts in zip(source.points(STEP), zip(*planes)):
             for number, (mean, colours, steep) in zip(numbers, parts):
                 grey[number, rows] = mean
                 if coloured is not None:
@@ -163,9 +158,7 @@ def _plane(
     streams = shared(bands_of, source.count)
     seen = (pictures(stream, source, number, slope) for number, stream in enumerate(streams))
     parts = (np.stack(channels) for channels in zip(*seen))
-    around = [widened(rows, 1, STEP * source.shape[0]) for rows in _points(source)]
-    for rows, more, part in zip(_points(source), around, windows(parts, around)):
-        own = slice(rows.start - more.start, rows.stop - more.start)
+    for own, part in around(parts, source.points(STEP), 1):
         mean = known_mean(part, 0)
         down, right = np.gradient(mean)
         yield mean[own], part[:, own], (down**2 + right**2)[own]
@@ -180,7 +173,7 @@ def _in_focus(source: SampleBands, slope: np.ndarray, room: Room) -> tuple[Any, 
         pictures(stream, source, number, slope)
         for number, stream in enumerate(shared(source, source.count))
     ]
-    for rows, parts in zip(_points(source), zip(*seen)):
+    for rows, parts in zip(source.points(STEP), zip(*seen)):
         grey[rows] = known_mean(np.stack(parts), 0)
         if coloured is not None:
             coloured[:, rows] = np.stack(parts)

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from plenocli.base.tiling import shared, widened, windows
+from plenocli.base.tiling import around, shared
 from plenocli.inverse.lightfield.samples import SampleBands, Samples
 
 STEP = 4
@@ -132,15 +132,11 @@ def pictures(
     from scipy.ndimage import convolve1d
 
     least = FAINT * (float(source.survey.each[number]) if each is None else each)
-    count = source.shape[0] * step
-    own = [slice(step * rows.start, step * rows.stop) for rows in source.rows]
-    around = [widened(rows, step - 1, count) for rows in own]
     tent = 1 - np.abs(np.arange(1 - step, step)) / step
-    sums = windows(_sums(bands, source, number, slope, step, 3 if squares else 2), around)
-    for rows, more, part in zip(own, around, sums):
+    sums = _sums(bands, source, number, slope, step, 3 if squares else 2)
+    for own, part in around(sums, source.points(step), step - 1):
         if step > 1:
-            part = convolve1d(part, tent, axis=1, mode="constant")
-            part = part[:, rows.start - more.start : rows.stop - more.start]
+            part = convolve1d(part, tent, axis=1, mode="constant")[:, own]
             part = convolve1d(part, tent, axis=2, mode="constant")
         weight = np.where(part[0] > least, part[0], np.nan)
         picture = part[1] / weight

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from plenocli.base.errors import InputError
-from plenocli.base.tiling import EVERYTHING, Plane, bands
+from plenocli.base.tiling import bands
 
 AT_ONCE = 1 << 18
 """Samples, or pixels for them, that are worked on together: temporary arrays are no larger."""
@@ -123,10 +123,8 @@ class SampleBands:
     where: str | Path | None = None
 
     @classmethod
-    def of(cls, samples: Samples | SampleBands, shape: tuple[int, int]) -> SampleBands:
-        """Those of samples in memory; shape: of a picture. SampleBands are some already."""
-        if isinstance(samples, SampleBands):
-            return samples
+    def of(cls, samples: Samples, shape: tuple[int, int]) -> SampleBands:
+        """Those of samples in memory; shape: of a picture."""
         cell = picture_rows(samples.centres, samples.pitch, shape[0])[samples.lenslet]
         order = np.argsort(cell, kind="stable")
         rows = bands(shape[0], int(AT_ONCE * shape[0] / max(len(cell), 1)))
@@ -151,6 +149,10 @@ class SampleBands:
     def count(self) -> int:
         """Of the channels, one of grey samples."""
         return 1 if self.channels is None else len(self.channels.names)
+
+    def points(self, step: int) -> list[slice]:
+        """Rows of a picture of `step` points a pitch, of each band."""
+        return [slice(step * rows.start, step * rows.stop) for rows in self.rows]
 
     def __iter__(self) -> Iterator[tuple[Samples, ...]]:
         return (self.read(number) for number in range(len(self.rows)))
@@ -204,8 +206,8 @@ def joined(parts: Sequence[Samples], channels: Channels | None = None) -> Sample
 
 
 def collect(
-    signal: np.ndarray | Plane,
-    white: np.ndarray | Plane,
+    signal: np.ndarray,
+    white: np.ndarray,
     centres: np.ndarray,
     valid: np.ndarray,
     pitch: float,
@@ -213,8 +215,7 @@ def collect(
 ) -> Samples:
     """Grey samples of a mosaic.
 
-    signal, white: (row, column), dark taken off; white is 0 where a pixel does not count. Of Planes
-        the rows of these lenslets are read.
+    signal, white: (row, column), dark taken off; white is 0 where a pixel does not count.
     centres: (..., 2) px, row and column, of lenslets.
     valid: (...) bool.
     pitch: lenslet spacing, px.
@@ -225,23 +226,19 @@ def collect(
     half = int(pitch // 2)
     steps = np.arange(-half, half + 1)
     near = np.rint(found).astype(int)
-    whole = Plane.of(signal)
-    ends = near[:, 0].min(initial=whole.shape[0]) - half, near[:, 0].max(initial=0) + half + 1
-    top, bottom = (int(n) for n in np.clip(ends, 0, whole.shape[0]))
-    signal, white = (Plane.of(p).read(slice(top, bottom), EVERYTHING) for p in (whole, white))
-    sides, near = np.array([bottom - top, whole.shape[1]]), near - (top, 0)
+    sides = np.array(signal.shape)
     at = near[:, :, None] + steps  # (lenslet, axis, step)
-    away = at - (found - (top, 0))[:, :, None]
+    away = at - found[:, :, None]
     inside = (at >= 0) & (at < sides[:, None])
     at = np.clip(at, 0, np.maximum(sides - 1, 0)[:, None])
-    index = at[:, 0, :, None] * whole.shape[1] + at[:, 1, None, :]
-    level = np.asarray(white).ravel()[index] if index.size else np.zeros(index.shape)
+    index = at[:, 0, :, None] * signal.shape[1] + at[:, 1, None, :]
+    level = white.ravel()[index] if index.size else np.zeros(index.shape)
     if not inside.all():
         level = np.where(inside[:, 0, :, None] & inside[:, 1, None, :], level, 0.0)
     inside &= np.abs(away) <= pitch / 2
     used = level > threshold * level.max(axis=(1, 2), keepdims=True)
     used &= inside[:, 0, :, None] & inside[:, 1, None, :]
-    seen = np.asarray(signal).ravel()[index[used]]
+    seen = signal.ravel()[index[used]]
     finite = np.isfinite(seen)
     lenslet, row, column = (numbers[finite] for numbers in np.nonzero(used))
     return Samples(

@@ -71,3 +71,12 @@ def namespace(array: Any) -> Any:
     from array_api_compat import array_namespace
 
     return array_namespace(array)
+
+
+def beside(array: Any, values: np.ndarray) -> Any:
+    """Values of NumPy where an array is."""
+    if isinstance(array, np.ndarray):
+        return values
+    from array_api_compat import device as place_of
+
+    return namespace(array).asarray(values, device=place_of(array))

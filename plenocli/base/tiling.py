@@ -15,6 +15,8 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
+from plenocli.base.device import namespace
+
 T = TypeVar("T")
 BAND, LEAST = 1 << 18, 16
 """Points of a band of a Plane, about, and its rows at least."""
@@ -29,14 +31,13 @@ def to_blocks(plane: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     Returns (lenslet_row, lenslet_column, sample), samples numbered row by row, those of one band
     after those of the other.
     """
+    xp = namespace(plane)
     if plane.ndim == 3:
-        return np.concatenate([to_blocks(one, shape) for one in plane], axis=2)
+        bands = (to_blocks(plane[k, ...], shape) for k in range(plane.shape[0]))
+        return xp.concat(list(bands), axis=2)
     rows, columns = plane.shape[0] // shape[0], plane.shape[1] // shape[1]
-    return (
-        plane.reshape(rows, shape[0], columns, shape[1])
-        .swapaxes(1, 2)
-        .reshape(rows, columns, shape[0] * shape[1])
-    )
+    parts = xp.reshape(plane, (rows, shape[0], columns, shape[1]))
+    return xp.reshape(xp.permute_dims(parts, (0, 2, 1, 3)), (rows, columns, shape[0] * shape[1]))
 
 
 def to_plane(blocks: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
@@ -48,19 +49,12 @@ def to_plane(blocks: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     Returns (row, column); more samples than a block holds are several bands, and give
     (band, row, column).
     """
-    rows, columns = blocks.shape[:2]
-    if blocks.ndim == 3 and blocks.shape[2] > shape[0] * shape[1]:
-        return np.stack(
-            [
-                to_plane(band, shape)
-                for band in np.split(blocks, blocks.shape[2] // (shape[0] * shape[1]), axis=2)
-            ]
-        )
-    return (
-        blocks.reshape(rows, columns, *shape)
-        .swapaxes(1, 2)
-        .reshape(rows * shape[0], columns * shape[1])
-    )
+    xp, (rows, columns), size = namespace(blocks), blocks.shape[:2], shape[0] * shape[1]
+    if blocks.ndim == 3 and blocks.shape[2] > size:
+        bands = range(0, blocks.shape[2], size)
+        return xp.stack([to_plane(blocks[:, :, at : at + size], shape) for at in bands])
+    parts = xp.permute_dims(xp.reshape(blocks, (rows, columns, *shape)), (0, 2, 1, 3))
+    return xp.reshape(parts, (rows * shape[0], columns * shape[1]))
 
 
 def in_lenslets(cells: np.ndarray, several: int) -> np.ndarray:

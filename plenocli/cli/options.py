@@ -407,6 +407,17 @@ def file_type(first: str, second: str) -> Callable:
     )
 
 
+def device(what: str) -> Callable:
+    """--device, where a command's large arrays are; what: is done there, for its help."""
+    return click.option(
+        "--device",
+        type=click.Choice(["cpu", "cuda"]),
+        default="cpu",
+        show_default=True,
+        help=f"{what}; cuda is a graphics card, by PyTorch.",
+    )
+
+
 def command_line(ctx: click.Context) -> str:
     """The command as typed, without folders and without options left at their default: it goes
     into the artefact.

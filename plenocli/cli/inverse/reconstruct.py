@@ -113,6 +113,7 @@ METHODS = (
 @click.option(
     "--clip", is_flag=True, help="Set negative values to zero; their share is reported either way."
 )
+@options.device("Where plug and play works, as pnp or in auto")
 @options.file_type("h5", "exr")
 @options.output
 @options.seed
@@ -141,6 +142,7 @@ def command(
     hold_out: float | None,
     fit: bool,
     clip: bool,
+    device: str,
     suffix: str,
     output: Path,
     seed: int,
@@ -204,6 +206,7 @@ def command(
                 hold_out=hold_out,
                 fit=fit,
                 clip=clip,
+                device=device,
                 seed=seed,
                 workers=workers,
             ),

@@ -81,13 +81,7 @@ class _Background(click.ParamType):
         "one, whose structure it may share; by total variation of what is not in the other."
     ),
 )
-@click.option(
-    "--device",
-    type=click.Choice(["cpu", "cuda"]),
-    default="cpu",
-    show_default=True,
-    help="Where kernels are multiplied and transformed; cuda is a graphics card, by PyTorch.",
-)
+@options.device("Where kernels are multiplied and transformed")
 @options.output
 @options.seed
 @options.mem_limit

@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from plenocli.base.device import CPU, Device
 from plenocli.base.linear_maps import BlockToeplitz
 from plenocli.base.progress import bar
 from plenocli.inverse.picture.lenslet_model import Keep, LensletMatrix, work_out
@@ -79,14 +80,16 @@ class Estimators:
         *,
         threads: int | None = None,
         keep: Keep = work_out,
+        device: Device = CPU,
     ) -> None:
         """keep: of decompositions, and of what photographs are like.
 
         read_pictures: gives the training pictures; read_dictionary: the learnt dictionary, None
-        where there is none; threads: of compiled code, None for all cores.
+        where there is none; threads: of compiled code, None for all cores; device: of plug and
+        play.
         """
         self.system, self.options, self.threads = system, options, threads
-        self.keep = keep
+        self.keep, self.device = keep, device
         self.read_pictures, self.read_dictionary = read_pictures, read_dictionary
         self.through = []
         self.trials: dict[TrialKey, dict[str, float]] = {}
@@ -125,6 +128,7 @@ class Estimators:
             self.read_pictures,
             None if self.read_dictionary is None else lambda: self.learnt,
             threads=self.threads,
+            device=self.device,
         )
         one.svd, one.prior = self.svd, self.prior
         return one
@@ -146,6 +150,7 @@ class Estimators:
             self.read_pictures,
             None if self.read_dictionary is None else lambda: self.learnt,
             threads=self.threads,
+            device=self.device,
         )
         other.prior.pictures_of = self.prior.pictures_of
         other.prior.statistics = self.prior.statistics

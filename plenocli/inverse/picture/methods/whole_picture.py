@@ -42,18 +42,21 @@ class WholePictureStats:
     wide: whether that looked at 3x3 lenslets.
     rounds: of turns between data and prior.
     rule: in words.
+    device: the graphics card on which it did it; None: a processor.
     """
 
     expected_error: float
     rounds: int
     rule: str
     wide: bool = False
+    device: str | None = None
 
     def as_json(self) -> dict[str, Any]:
         """Names and values, as artefacts hold them."""
         over = " over 3x3 lenslets" if self.wide else ""
         start = f"lmmse{over}, which expects an error of {self.expected_error:.3g}"
-        return {"start": start, "rule": self.rule}
+        told = {"start": start, "rule": self.rule}
+        return told if self.device is None else told | {"device": self.device}
 
 
 def total_variation(
@@ -74,19 +77,29 @@ def plug_and_play(
     """
     taus = whole_sensor.schedule(error)
     denoise = whole_sensor.denoiser(estimators.prior.bands())
-    picture = whole_sensor.plug_and_play(term, start, denoise, bar(taus, len(taus), "rounds"))
+    there, rounds = estimators.device, bar(taus, len(taus), "rounds")
+    picture = there.get(
+        whole_sensor.plug_and_play(term.on(there), there.put(start), denoise, rounds)
+    )
     rule = f"{len(taus)} rounds of block matching, from {taus[0]:.3g} to {taus[-1]:.3g}"
     return picture, rule, len(taus)
 
 
 def _from_lmmse(
-    solve: Solve, wide: bool, factor: float, estimators: Estimators, light: OwnLight
+    solve: Solve,
+    factor: float,
+    estimators: Estimators,
+    light: OwnLight,
+    *,
+    wide: bool = False,
+    on_device: bool = False,
 ) -> Estimate:
     """The Estimate of `solve`, started from LMMSE.
 
     factor: of its standard deviation, see error_bars.
     wide: whether that may look over 3x3 lenslets, where the noise leaves something to be learnt
         from neighbours.
+    on_device: whether it takes the device of the estimators.
     """
     shape, y, inner, joint = estimators.system.object_shape, light.y, light.inner, light.joint
     noise = light.data.known_sigma
@@ -120,7 +133,13 @@ def _from_lmmse(
         value=found,
         sigma=sigma,
         from_lmmse=root_mean_square(found - x),
-        stats=WholePictureStats(expected_error=error, rounds=rounds, rule=rule, wide=wide),
+        stats=WholePictureStats(
+            expected_error=error,
+            rounds=rounds,
+            rule=rule,
+            wide=wide,
+            device=estimators.device.name if on_device else None,
+        ),
     )
 
 
@@ -130,13 +149,14 @@ TV = Estimator(
     phases=footprint.tv_phases,
     weighs_all=True,
     points_around=LOOK,
-    estimate=partial(_from_lmmse, total_variation, False, error_bars.BY_VARIATION),
+    estimate=partial(_from_lmmse, total_variation, error_bars.BY_VARIATION),
 )
 PNP = Estimator(
     name="pnp",
     sees=Sees.PICTURE,
     phases=footprint.pnp_phases,
+    options=("device",),
     weighs_all=True,
     points_around=LOOK,
-    estimate=partial(_from_lmmse, plug_and_play, True, error_bars.BY_MATCHING),
+    estimate=partial(_from_lmmse, plug_and_play, error_bars.BY_MATCHING, wide=True, on_device=True),
 )

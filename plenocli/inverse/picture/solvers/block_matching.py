@@ -9,11 +9,13 @@ by what is alike alone; of large pictures the rest is compiled where numba is th
 
 from __future__ import annotations
 
-from functools import lru_cache
+from functools import lru_cache, partial
 from types import ModuleType
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
+
+from plenocli.base.device import beside, namespace
 
 PATCH, STEP, SEARCH, STACK = 8, 4, 9, 16
 """Side of a patch, distance of reference patches, how far similar ones are searched, how many
@@ -21,8 +23,8 @@ are stacked (a power of two).
 """
 THRESHOLD = 2.7
 """Coefficients below so many standard deviations of the noise vanish; the paper's value."""
-TOGETHER = 4096
-"""Stacks that are filtered together."""
+TOGETHER, TOGETHER_ELSEWHERE = 1 << 12, 1 << 15
+"""Stacks that are filtered together, in NumPy's arrays and in those of others."""
 LARGE = 250_000
 """Points from which on a picture is worth the seconds in which the kernel is loaded."""
 
@@ -34,37 +36,37 @@ Matched = dict[int, np.ndarray]
 def block_matching(picture: np.ndarray, sigma: float, matched: Matched | None = None) -> np.ndarray:
     """A picture with its white noise removed.
 
-    picture: (row, column).
+    picture: (row, column), of any library whose arrays follow the array API standard.
     sigma: standard deviation of the noise.
     matched: what was found alike in a picture of this shape, for the next; filled where empty.
 
-    Returns (row, column) float64.
+    Returns (row, column) float64, where the picture is.
     Dabov et al. 2007.
     """
-    picture = np.asarray(picture, float)
-    unit = np.abs(picture).max()  # squares of very large or small values leave single precision
+    xp, here = namespace(picture), partial(beside, picture)
+    unit = float(xp.max(xp.abs(picture)))
     if unit == 0:
-        return picture.copy()
-    picture, sigma = picture / unit, sigma / unit
-    patch = min(PATCH, *picture.shape)
-    rows, columns = (_corners(n, patch) for n in picture.shape)
-    least = min(SEARCH + 1, picture.shape[0] - patch + 1) * min(
-        SEARCH + 1, picture.shape[1] - patch + 1
-    )
+        return here(np.zeros(picture.shape))
+    # squares of very large or small values leave single precision
+    sigma, source = sigma / unit, xp.asarray(picture / unit, dtype=xp.float32)
+    height, width = picture.shape
+    patch = min(PATCH, height, width)
+    rows, columns = _corners(height, patch), _corners(width, patch)
+    least = min(SEARCH + 1, height - patch + 1) * min(SEARCH + 1, width - patch + 1)
     stack = min(STACK, 1 << (least.bit_length() - 1))
-    source = np.asarray(picture, np.float32)
-    total, weight = np.zeros(picture.shape), np.zeros(picture.shape)
+    total, weight = here(np.zeros(picture.shape)), here(np.zeros(picture.shape))
     matched = {} if matched is None else matched
-    kernel = _kernel() if picture.size >= LARGE else None
-    for strip in np.array_split(rows, max(1, -(-len(rows) * len(columns) // TOGETHER))):
-        span = slice(max(strip[0] - SEARCH, 0), min(strip[-1] + patch + SEARCH, picture.shape[0]))
+    kernel = _kernel() if xp is np and picture.size >= LARGE else None
+    together = TOGETHER if xp is np else TOGETHER_ELSEWHERE
+    for strip in np.array_split(rows, max(1, -(-len(rows) * len(columns) // together))):
+        span = slice(max(strip[0] - SEARCH, 0), min(strip[-1] + patch + SEARCH, height))
         if strip[0] not in matched:
             match = _match if kernel is None else kernel.match
-            found = match(source[span], strip - span.start, columns, patch, SEARCH, stack)
-            matched[strip[0]] = found.astype(np.int32, copy=False)
-        one, two = _filter(source[span], matched[strip[0]], patch, sigma, kernel)
-        total[span] += one
-        weight[span] += two
+            found = match(source[span, :], strip - span.start, columns, patch, SEARCH, stack)
+            matched[strip[0]] = xp.asarray(found, dtype=xp.int32)
+        one, two = _filter(source[span, :], matched[strip[0]], patch, sigma, kernel)
+        total[span, :] += one
+        weight[span, :] += two
     return unit * total / weight
 
 
@@ -91,41 +93,47 @@ def _match(
     source: np.ndarray, rows: np.ndarray, columns: np.ndarray, patch: int, reach: int, stack: int
 ) -> np.ndarray:
     """As `match` of the kernel, in whole arrays; among patches that are equally like, any."""
-    height, width = source.shape
-    sum_rows = np.zeros((len(rows), height), np.float32)
+    xp, here, (height, width) = namespace(source), partial(beside, source), source.shape
+    in_patches = np.zeros((len(rows), height), np.float32)
     for k, first in enumerate(rows):
-        sum_rows[k, first : first + patch] = 1
-    up_to = np.zeros((len(rows), width + 1))
+        in_patches[k, first : first + patch] = 1
+    sum_rows = here(in_patches)
     offsets = np.array([(r, c) for r in range(-reach, reach + 1) for c in range(-reach, reach + 1)])
-    distance = np.full((len(offsets), len(rows), len(columns)), np.inf, np.float32)
-    for k, (down, right) in enumerate(offsets):
+    distance = here(np.full((len(offsets), len(rows), len(columns)), np.inf, np.float32))
+    for k, (down, right) in enumerate(offsets.tolist()):
         r, c = (
             slice(max(0, -down), min(height, height - down)),
             slice(max(0, -right), min(width, width - right)),
         )
         if r.start >= r.stop or c.start >= c.stop:
             continue
-        at_r = slice(
-            np.searchsorted(rows, -down), np.searchsorted(rows, height - patch - down, side="right")
-        )
-        at_c = slice(
-            np.searchsorted(columns, -right),
-            np.searchsorted(columns, width - patch - right, side="right"),
+        at_r, at_c = (
+            slice(*np.searchsorted(corners, (-by, length - patch - by + 1)).tolist())
+            for corners, by, length in ((rows, down, height), (columns, right, width))
         )
         change = (
             source[r, c] - source[r.start + down : r.stop + down, c.start + right : c.stop + right]
         )
-        down_patches = sum_rows[at_r, r] @ np.square(change, out=change)
-        sums = up_to[: len(down_patches), : down_patches.shape[1] + 1]
-        np.cumsum(down_patches, axis=1, out=sums[:, 1:])
+        change *= change
+        down_patches = sum_rows[at_r, r] @ change
         first = columns[at_c] - c.start
-        distance[k, at_r, at_c] = sums[:, first + patch] - sums[:, first]
-    distance[len(offsets) // 2] = -1
-    by_patch = distance.reshape(len(offsets), -1).T
-    best = np.argpartition(by_patch, stack - 1, axis=1)[:, :stack]
-    order = np.argsort(np.take_along_axis(by_patch, best, 1), axis=1, kind="stable")
-    best = np.take_along_axis(best, order, 1)
-    return (rows[:, None] * width + columns).ravel()[:, None] + (offsets @ [width, 1])[best]
+        own = (xp.take(down_patches, here(first + n), axis=1) for n in range(patch))
+        distance[k, at_r, at_c] = sum(own)
+    distance[len(offsets) // 2, :, :] = -1
+    by_patch = xp.permute_dims(xp.reshape(distance, (len(offsets), -1)), (1, 0))
+    corners = here((rows[:, None] * width + columns).reshape(-1, 1))
+    steps = xp.take(here(offsets @ [width, 1]), xp.reshape(_smallest(by_patch, stack), (-1,)))
+    return corners + xp.reshape(steps, (-1, stack))
+
+
+def _smallest(values: np.ndarray, count: int) -> np.ndarray:
+    """Where in each row the `count` smallest are, these in order; among equals, any."""
+    xp = namespace(values)
+    if xp is not np:
+        return xp.argsort(values, axis=1)[:, :count]
+    best = np.argpartition(values, count - 1, axis=1)[:, :count]
+    order = np.argsort(np.take_along_axis(values, best, 1), axis=1, kind="stable")
+    return np.take_along_axis(best, order, 1)
 
 
 def _filter(
@@ -136,43 +144,71 @@ def _filter(
     Every patch of the plane is transformed once, and what stacks make of it is summed before it is
     transformed back.
     """
-    shape = source.shape
-    corners = (shape[0] - patch + 1, shape[1] - patch + 1)
+    xp, here, (height, width) = namespace(source), partial(beside, source), source.shape
+    corners = (height - patch + 1, width - patch + 1)
     cosine, _, taper = _transforms(patch, stacks.shape[1])
-    rows, columns = np.divmod(stacks, shape[1])
-    patches = sliding_window_view(source, (patch, patch)).reshape(-1, patch * patch)
+    rows, columns = stacks // width, stacks % width
+    patches = xp.reshape(_patches(source, patch), (-1, patch * patch))
     shrink = _shrink if kernel is None else kernel.shrink
-    sums, counted = shrink(patches @ cosine.T, rows * corners[1] + columns, THRESHOLD * sigma)
-    planes = (cosine.T @ sums.T).reshape(patch, patch, *corners)
-    counted = counted.reshape(corners)
-    total, weights = np.zeros(shape), np.zeros(shape)
+    spectra = patches @ here(cosine.T)
+    sums, counted = shrink(spectra, rows * corners[1] + columns, THRESHOLD * sigma)
+    planes = xp.reshape(here(cosine.T) @ xp.permute_dims(sums, (1, 0)), (patch, patch, *corners))
+    counted = xp.reshape(counted, corners)
+    total, weights = here(np.zeros(source.shape)), here(np.zeros(source.shape))
     for r, c in np.ndindex(patch, patch):
-        here = np.s_[r : r + corners[0], c : c + corners[1]]
-        total[here] += taper[r * patch + c] * planes[r, c]
-        weights[here] += taper[r * patch + c] * counted
+        there, share = np.s_[r : r + corners[0], c : c + corners[1]], float(taper[r * patch + c])
+        total[there] += share * planes[r, c, :, :]
+        weights[there] += share * counted
     return total, weights
+
+
+def _patches(source: np.ndarray, patch: int) -> np.ndarray:
+    """(row, column, patch row, patch column) of the patches with corners at every sample."""
+    xp, (height, width) = namespace(source), source.shape
+    if xp is np:
+        return sliding_window_view(source, (patch, patch))
+    ends = height - patch + 1, width - patch + 1
+    parts = [source[r : r + ends[0], c : c + ends[1]] for r, c in np.ndindex(patch, patch)]
+    return xp.reshape(xp.stack(parts, axis=2), (*ends, patch, patch))
 
 
 def _shrink(
     spectra: np.ndarray, stacks: np.ndarray, threshold: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """As `shrink` of the kernel, in whole arrays."""
-    from scipy.sparse import csr_array
-
-    count, at = stacks.shape[1], stacks.T.ravel()
-    across = _transforms(PATCH, count)[1]
-    spectrum = (across @ spectra[at].reshape(count, -1)).reshape(count, len(stacks), -1)
-    keep = np.abs(spectrum) > threshold
-    keep[0, :, 0] = True
+    xp, (number, count) = namespace(spectra), stacks.shape
+    at = xp.reshape(xp.permute_dims(stacks, (1, 0)), (-1,))
+    across = beside(spectra, _transforms(PATCH, count)[1])
+    spectrum = across @ xp.reshape(xp.take(spectra, at, axis=0), (count, -1))
+    spectrum = xp.reshape(spectrum, (count, number, -1))
+    keep = xp.asarray(xp.abs(spectrum) > threshold, dtype=xp.float32)
+    keep[0, :, 0] = 1
     spectrum *= keep
-    weight = 1 / keep.sum(axis=(0, 2), dtype=np.float32)
+    weight = 1 / xp.sum(keep, axis=(0, 2))
     spectrum *= weight[:, None]
-    back = (across @ spectrum.reshape(count, -1)).reshape(len(at), -1)
-    # which stacks each patch is in
-    order = np.argsort(at, kind="stable")
-    starts = np.searchsorted(at[order], np.arange(len(spectra) + 1))
-    member = csr_array((np.ones(len(at), np.float32), order, starts), (len(starts) - 1, len(at)))
-    return member @ back, member @ np.tile(weight, count)
+    back = xp.reshape(across @ xp.reshape(spectrum, (count, -1)), (number * count, -1))
+    both = _summed(at, spectra.shape[0], back, xp.tile(weight, (count,))[:, None])
+    return both[0], both[1][:, 0]
+
+
+def _summed(at: np.ndarray, size: int, *values: np.ndarray) -> list[np.ndarray]:
+    """Rows of values added up where `at` says, among `size` places."""
+    xp = namespace(at)
+    order = xp.argsort(at, stable=True)
+    starts = xp.searchsorted(xp.take(at, order), beside(at, np.arange(size + 1, dtype=np.int32)))
+    if xp is np:
+        from scipy.sparse import csr_array
+
+        # which of the rows each place has
+        member = csr_array((np.ones(len(at), np.float32), order, starts), (size, len(at)))
+        return [member @ one for one in values]
+    found = []
+    for one in values:
+        rows = xp.astype(xp.take(one, order, axis=0), xp.float64)
+        up_to = xp.cumulative_sum(rows, axis=0, include_initial=True)
+        parts = xp.take(up_to, starts[1:], axis=0) - xp.take(up_to, starts[:-1], axis=0)
+        found.append(xp.astype(parts, one.dtype))
+    return found
 
 
 @lru_cache(maxsize=8)

@@ -12,10 +12,12 @@ Total variation is the convex case, by the alternating direction method of multi
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from copy import copy
 from itertools import count
 
 import numpy as np
 
+from plenocli.base.device import Device, beside, namespace
 from plenocli.base.tiling import to_blocks, to_plane
 from plenocli.inverse.picture.solvers.least_squares import Svd
 
@@ -65,16 +67,25 @@ class DataTerm:
         kept = max(1, int(np.count_nonzero((svd.s * contrast) ** 2 > 1e-3 * sigma**2)))
         self.s, self.vt, self.z = svd.s[:kept], svd.vt[:kept], y @ svd.u[:, :kept]
 
+    def on(self, device: Device) -> DataTerm:
+        """The same for pictures that are on a device."""
+        there = copy(self)
+        there.s, there.vt, there.z = (device.put(one) for one in (self.s, self.vt, self.z))
+        if self.held is not None:
+            there.held = device.put(self.held[0]), device.put(self.held[1])
+        return there
+
     def proximal(self, picture: np.ndarray, tau: float) -> np.ndarray:
         """argmin over x of |y - A x|^2/sigma^2 + |x - picture|^2/tau^2, pictures (row, column)
         or (band, row, column).
         """
-        v = to_blocks(picture, self.shape)
+        xp, v = namespace(picture), to_blocks(picture, self.shape)
         share = self.s / (self.s**2 + (self.sigma / tau) ** 2)
-        x = v + ((self.z - (v @ self.vt.T) * self.s) * share) @ self.vt
+        seen = v @ xp.permute_dims(self.vt, (1, 0))
+        x = v + ((self.z - seen * self.s) * share) @ self.vt
         if self.held is not None:
             mask, known = self.held
-            x[mask] = known[mask]
+            x = xp.where(mask[:, :, None], known, x)
         return to_plane(x, self.shape)
 
 
@@ -100,10 +111,11 @@ def denoiser(bands: np.ndarray) -> Denoise:
                 matched.clear()
         if picture.ndim == 2:
             return block_matching(picture, tau, matched=alike[0])
-        turn = np.linalg.eigh(bands)[1].T
-        planes = zip(np.tensordot(turn, picture, 1), alike)
+        xp, turn = namespace(picture), beside(picture, np.linalg.eigh(bands)[1])
+        turned = xp.tensordot(xp.permute_dims(turn, (1, 0)), picture, axes=1)
+        planes = ((turned[k, :, :], matched) for k, matched in enumerate(alike))
         found = [block_matching(plane, tau, matched=matched) for plane, matched in planes]
-        return np.tensordot(turn.T, np.stack(found), 1)
+        return xp.tensordot(turn, xp.stack(found), axes=1)
 
     return denoise
 
@@ -113,13 +125,13 @@ def plug_and_play(
 ) -> np.ndarray:
     """The picture after a round of v = denoise(x, tau), x = term.proximal(v, tau) for each tau.
 
-    term: what the data say.
+    term: what the data say, on the device of `start`.
     denoise: of a picture and the standard deviation of its noise.
     start: the first x, (row, column) or (band, row, column).
     taus: falling, see `schedule`.
     """
     x = start
-    for tau in taus:
+    for tau in map(float, taus):
         x = term.proximal(denoise(x, tau), tau)
     return x
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from plenocli.base.device import device as device_of
 from plenocli.base.errors import PlenoError
 from plenocli.base.progress import bar, collected_notes
 from plenocli.execution.pool import absolute, run_all
@@ -39,6 +40,7 @@ class Settings:
     truth: what chooses a weight with hindsight.
     fit: fit the camera to each capture first.
     clip: set negative values to zero.
+    device: "cpu" or "cuda", where plug and play works.
     seed: of every random stream.
     workers: processes.
     """
@@ -56,6 +58,7 @@ class Settings:
     hold_out: float | None = None
     fit: bool = False
     clip: bool = False
+    device: str = "cpu"
     seed: int = 0
     workers: int = 1
 
@@ -146,6 +149,7 @@ def estimators_of(recipe: Recipe) -> Estimators:
         None if learnt is None else partial(read_dictionary, learnt, system),
         threads=recipe.threads,
         keep=kept,
+        device=device_of(settings.device),
     )
 
 

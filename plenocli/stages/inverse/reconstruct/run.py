@@ -135,6 +135,7 @@ def _check_options(settings: Settings, pif: Path | None, calibration: Path | Non
         ("nnls_iterations", "nnls-iterations", settings.nnls_iterations),
         ("hold_out", "hold-out", settings.hold_out),
         ("dictionary", "dictionary", settings.dictionary),
+        ("device", "device", None if settings.device == "cpu" else settings.device),
     ):
         if value is not None and option not in method.options:
             raise UsageError(

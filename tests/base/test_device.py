@@ -2,11 +2,14 @@
 
 import numpy as np
 import pytest
+from scipy.sparse import csr_array
 
 from plenocli.base.device import CPU, Device, device
 from plenocli.base.errors import UsageError
 from plenocli.base.linear_maps import BlockCirculant, times, times_adjoint
 from plenocli.base.tiling import to_blocks
+from plenocli.forward.propagation.exact.low_rank_product import Product
+from plenocli.forward.propagation.fresnel.separable_fields import Factors
 from plenocli.inverse.picture.solvers import block_matching, whole_sensor
 from plenocli.inverse.picture.solvers.least_squares import decompose
 from plenocli.inverse.volume.lmmse import lmmse
@@ -57,6 +60,48 @@ def test_volumes_are_the_same_elsewhere(other, method):
         for where in (CPU, other)
     )
     assert np.abs(one - two).max() < 1e-4 * np.abs(one).max()
+
+
+@pytest.mark.parametrize("symmetric", [False, True])
+def test_a_product_is_compressed_elsewhere(other, symmetric):
+    rng = np.random.default_rng(9)
+    left, right = rng.normal(size=(2, 300, 90)) + 1j * rng.normal(size=(2, 300, 90))
+    right = left if symmetric else right
+    weights = np.exp(-0.3 * np.arange(90))
+    full = left * weights @ right.T
+    cut = 1e-3 * np.linalg.norm(full)
+    rank = np.count_nonzero(np.cumsum(np.linalg.svd(full)[1][::-1] ** 2) > cut**2)
+    sparse = csr_array(np.diag(weights).astype(complex))
+    for coupling in (np.diag(weights).astype(complex), sparse):
+        factors = [left, left], [right, right]
+        halves = {(0, 0): coupling / 2, (1, 1): coupling / 2}
+        one = Product(factors[0], factors[0] if symmetric else factors[1], halves, symmetric, other)
+        high, wide = one.factors(cut, 12)
+        assert isinstance(high, np.ndarray) and high.shape[1] <= rank + 1
+        assert np.linalg.norm(high @ wide.T - full) < 1.5 * cut
+        x, y, core = one.narrowed(cut)
+        assert np.linalg.norm(x @ core @ y.T - full) < 2.5 * cut and x.shape[1] < 90
+
+
+@pytest.mark.parametrize("signed", [False, True])
+def test_pixel_energies_are_the_same_elsewhere(other, signed):
+    rng = np.random.default_rng(10)
+    high, wide = (
+        (rng.normal(size=(2, 5, 3 * n, 7)) + 1j * rng.normal(size=(2, 5, 3 * n, 7))) for n in (4, 6)
+    )
+    signs = rng.choice([-1, 1], 7) if signed else None
+    rows, columns = np.array([4, 0, 1, 2, 4]), np.array([1, 3, 1, 3, 0])
+    found = np.empty((5, 4, 6))
+    Factors(high, wide, (4, 6), 3, signs, other).superpixel(1, 0, rows, columns, found)
+    for one, r, c in zip(found, rows, columns):
+        field = (high[1, r] * (1 if signs is None else signs)) @ wide[0, c].T
+        # nodes of a pixel run slowest
+        parts = (np.abs(field) ** 2).reshape(3, 4, 3, 6)
+        np.testing.assert_allclose(one, parts.sum(axis=(0, 2)), rtol=1e-12)
+    if not signed:
+        turned = np.empty((5, 6, 4))
+        Factors(high, wide, (4, 6), 3, None, other).turned.superpixel(0, 1, columns, rows, turned)
+        np.testing.assert_allclose(turned, found.transpose(0, 2, 1), rtol=1e-12)
 
 
 @pytest.mark.parametrize("bands", [1, 2])

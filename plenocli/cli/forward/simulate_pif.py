@@ -101,6 +101,7 @@ class _Step(click.ParamType):
     show_default=True,
     help="Type of the stored matrix.",
 )
+@options.device("Where the products of --model exact, square lenslets, are compressed")
 @click.option(
     "--explain", is_flag=True, help="Print the plan, its cost and its reasons; compute nothing."
 )
@@ -125,6 +126,7 @@ def command(
     scene: Path | None,
     calibration: Path | None,
     dtype: str,
+    device: str,
     explain: bool,
     workers: int,
     overwrite: bool,
@@ -162,6 +164,7 @@ def command(
             scene=scene,
             calibration=calibration,
             dtype=dtype,
+            device=device,
         ),
         explain=explain,
         overwrite=overwrite,

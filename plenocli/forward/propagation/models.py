@@ -39,13 +39,15 @@ class Model(ABC):
     name: as plans and tables show it;
     kind: "ray", "fresnel" or "exact", what --model asks for;
     lenslets: the LensletFields that compute it;
-    libraries: with threads of their own, which it computes with beside numpy.
+    libraries: with threads of their own, which it computes with beside numpy;
+    on_device: whether a graphics card may do a part of it.
     """
 
     name: str
     kind: str
     lenslets: type[LensletFields]
     libraries: tuple[str, ...] = ()
+    on_device: bool = False
 
     @abstractmethod
     def valid_for(self, camera: Camera, geometry: Geometry) -> str | None:
@@ -177,7 +179,7 @@ class ExactLowRank(Model):
     """Scalar waves without the paraxial approximation, through square lenslets."""
 
     name, kind, lenslets = "exact, low rank", "exact", exact.ExactSquareLenslets
-    libraries = ("scipy.linalg",)
+    libraries, on_device = ("scipy.linalg",), True
     valid_for = staticmethod(exact.valid_for)
     size = staticmethod(exact.exact_band)
     features = staticmethod(cost_law.features)

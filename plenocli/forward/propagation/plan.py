@@ -120,7 +120,8 @@ class PifPlan:
     pixel_shift: of an off-axis lenslet on the sensor's own raster
         (plenocli.forward.camera.geometry.lenslet_shift), None where windows are centred;
     chief: where that lenslet stands from the axis, m (rows, columns);
-    band_nodes: wavelengths that stand for the camera's band of light, 0 for lines.
+    band_nodes: wavelengths that stand for the camera's band of light, 0 for lines;
+    device: where the products of an exact model are compressed, as plenocli.base.device names it.
     """
 
     model: str
@@ -146,6 +147,7 @@ class PifPlan:
     pixel_shift: tuple[float, float] | None = None
     chief: tuple[float, float] = (0.0, 0.0)
     band_nodes: int = 0
+    device: str = "cpu"
 
     @property
     def chosen(self) -> Candidate:

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from plenocli.base.budget import one_thread, spread
+from plenocli.base.device import device
 from plenocli.base.errors import NumericsError
 from plenocli.forward.camera.field import at_field
 from plenocli.forward.camera.geometry import geometry
@@ -74,7 +75,8 @@ class MatrixNotes:
     diffraction_cells: of a lenslet, per axis;
     energy_min, energy_max: of all columns;
     chief: where the lenslet stands from the axis, m (rows, columns);
-    window: of an off-axis lenslet.
+    window: of an off-axis lenslet;
+    device: the graphics card that compressed products, None for a processor.
     """
 
     model: str
@@ -100,11 +102,14 @@ class MatrixNotes:
     warnings: tuple[str, ...]
     chief: tuple[float, float] = (0.0, 0.0)
     window: LensletWindow | None = None
+    device: str | None = None
 
     def as_json(self) -> dict[str, Any]:
         """The notes as artefacts hold them: what is known of the window stands among the rest."""
         notes = asdict(self)
         window = notes.pop("window")
+        if self.device is None:
+            del notes["device"]
         return notes | (window or {})
 
 
@@ -591,4 +596,5 @@ def _notes(
         reasons=plan.reasons,
         warnings=plan.warnings,
         chief=plan.chief,
+        device=device(plan.device).name,
     )

@@ -46,7 +46,8 @@ class Settings:
     lenslet: (row, column) of the array, None for the one on the axis;
     field_nodes: places of the field along an axis whose matrices stand for all lenslets, an odd
         number, "auto" or None for the axis alone;
-    dtype: "auto", "float32" or "float64".
+    dtype: "auto", "float32" or "float64";
+    device: "cpu" or "cuda", where the products of an exact model are compressed.
     """
 
     wavelengths: tuple[float, ...] = ()
@@ -60,6 +61,7 @@ class Settings:
     lenslet: tuple[int, int] | None = None
     field_nodes: int | Literal["auto"] | None = None
     dtype: str = "auto"
+    device: str = "cpu"
 
 
 def run_simulate_pif(
@@ -256,7 +258,7 @@ def _write(task: _Task, job: _Job, output: Path | str) -> PifSummary:
     from plenocli.forward.propagation.diagnosis import describe
     from plenocli.forward.propagation.system_matrix import build_pif
 
-    camera, plan = job.camera, job.plan
+    camera, plan = job.camera, _on_device(job.plan, task.settings.device)
     provenance = _provenance(task.camera_path, camera, task.settings, plan, task.command)
 
     def finish(matrix: SystemMatrix, found: Diagnosis) -> Artefact:
@@ -289,6 +291,16 @@ def _write(task: _Task, job: _Job, output: Path | str) -> PifSummary:
     if not chosen.streamed:
         write_artefact(output, finish(matrix, found), overwrite=task.overwrite)
     return summary_of(str(output), matrix, found, plan)
+
+
+def _on_device(plan: PifPlan, device: str) -> PifPlan:
+    """The plan with what of it a device can do there, and a note where that is nothing."""
+    from plenocli.forward.propagation.models import model_named
+
+    if device == "cpu" or model_named(plan.rung).on_device:
+        return replace(plan, device=device)
+    note(f"--device {device}: {plan.rung}, is computed on the processor")
+    return plan
 
 
 def _write_several(

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from plenocli.base.budget import budget, spread, within
+from plenocli.base.device import device
 from plenocli.forward.camera.quadrature import gauss, nodes_for
 from plenocli.forward.propagation.exact.debye import spherical_field
 from plenocli.forward.propagation.exact.interval_pairs import Interval, Modes, Pair, SensorSide
@@ -149,6 +150,7 @@ class ExactSquareLenslets(LensletFields):
     def __init__(self, camera: Camera, geometry: Geometry, plan: PifPlan, band: ExactBand) -> None:
         self.geometry, self.superpixels, self.band = geometry, plan.superpixels, band
         self.dtype = np.dtype(np.complex128 if plan.double else np.complex64)
+        self.device = device(plan.device)
         self._parabolic = camera.lenslet_array.profile == "parabolic"
         g = geometry
         self._field = (
@@ -374,9 +376,8 @@ class ExactSquareLenslets(LensletFields):
             tolerance = cut / 2 if (m, n) == kept[-1] else cut / 2 / math.sqrt(len(kept))
             x, y, coupling = pair.factors(max(self._extent), tolerance)
             if (m, n) != kept[-1]:  # its own rank may be far lower
-                x, y, coupling = Product([x], [y], {(0, 0): coupling}, pair.symmetric).narrowed(
-                    tolerance / 2 * math.sqrt(count)
-                ) or (x, y, coupling)
+                one = Product([x], [y], {(0, 0): coupling}, pair.symmetric, self.device)
+                x, y, coupling = one.narrowed(tolerance / 2 * math.sqrt(count)) or (x, y, coupling)
             if not alone:  # lenslets interfere on the pixels
                 x, y = pair.on_pixels(x, y)
             # the lenslet mirrored by the diagonal brings the transpose
@@ -388,7 +389,7 @@ class ExactSquareLenslets(LensletFields):
                 left, right = [*left, x], [*right, y]
                 couplings[first, first] = coupling
         right = left if symmetric else right
-        product = Product(left, right, couplings, symmetric)
+        product = Product(left, right, couplings, symmetric, self.device)
         high, wide = product.factors(
             self.band.cut * math.sqrt(count),
             guess,
@@ -402,6 +403,7 @@ class ExactSquareLenslets(LensletFields):
             self._by_point(wide, self._sensor_side(sx, 1, beside))[None],
             self.geometry.pixel_shape,
             self.band.pixel_nodes,
+            device=self.device,
         ), products
 
     def _expected_rank(self, sy: int, sx: int) -> float:
@@ -436,10 +438,7 @@ class ExactSquareLenslets(LensletFields):
         sy, sx = sy - self._reach(0), sx - self._reach(1)
         row, column, turned = self._canonical(sy, sx)
         table, shape = self._tables[row, column], self.geometry.object_shape
-        if turned:
-            table = Factors(
-                table.wide, table.high, self.geometry.pixel_shape, self.band.pixel_nodes
-            )
+        table = table.turned if turned else table
         # points whose own half of the lenslet has no table
         far_y, far_x = (
             self.symmetry[axis] & ((s < 0) | ((s == 0) & (index >= (shape[axis] + 1) // 2)))

@@ -4,16 +4,19 @@ without being formed.
 The range is found by random combinations of M's columns (Halko, Martinsson, Tropp 2011), which cost
 as little as the factors have terms; what is seen of M through an orthonormal basis of it is a small
 core, whose singular values say where to cut. Where factors have many more terms than M,
-combinations of both rows and columns show first how many of them it takes, and which.
+combinations of both rows and columns show first how many of them it takes, and which. All of this
+is done where the device has its arrays; what goes in and comes out are NumPy's.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
+from plenocli.base.device import CPU, Device, beside, namespace
 from plenocli.base.errors import NumericsError
 from plenocli.forward.propagation.fresnel.spread_function import terms_within
 
@@ -39,7 +42,8 @@ MAX_SKETCH = 2500
 class Product:
     """left, right: lists of X_a (rows, terms) and X_b (columns, terms);
     couplings: {(a, b): K_ab}, at least one for each factor;
-    symmetric: whether M^T = M, with the same factors on both sides.
+    symmetric: whether M^T = M, with the same factors on both sides;
+    device: where it is compressed.
     """
 
     def __init__(
@@ -48,13 +52,16 @@ class Product:
         right: list[np.ndarray],
         couplings: Mapping[tuple[int, int], Matrix],
         symmetric: bool,
+        device: Device = CPU,
     ) -> None:
-        self.left, self.right = left, right
-        self.couplings, self.symmetric = {key: thin(k) for key, k in couplings.items()}, symmetric
+        self.device, self.symmetric = device, symmetric
+        self.left = [device.put(x) for x in left]
+        self.right = self.left if right is left else [device.put(x) for x in right]
+        self.couplings = {key: _put_thin(device, k) for key, k in couplings.items()}
         self.limit = min(len(left[0]), len(right[0]))
         self.rng = np.random.default_rng(20130701)
 
-    def _through(self, side: int, blocks: list[np.ndarray]) -> list[np.ndarray]:
+    def _through(self, side: int, blocks: list[Any]) -> list[Any]:
         """The couplings times blocks (terms, t) of the other side's factors: list of (terms, t)
         for this side's (0 left, 1 right).
         """
@@ -68,42 +75,36 @@ class Product:
             for b in range(len(self.right))
         ]
 
-    def _times(self, side: int, seen: list[np.ndarray]) -> np.ndarray:
+    def _times(self, side: int, seen: list[Any]) -> Any:
         """M (side 0) or M^T (1) times combinations of its columns, given as what the other
         side's factors make of them: (rows, combinations).
         """
         mine = self.right if side else self.left
+        if self.device.xp is not np:
+            return sum(x @ y for x, y in zip(mine, self._through(side, seen)))
         out = np.zeros((len(mine[0]), seen[0].shape[1]), mine[0].dtype)
         for x, y in zip(mine, self._through(side, seen)):
             _add_product(out, x, y)
         return out
 
-    def _mixed(self, side: int, count: int) -> list[np.ndarray]:
+    def _mixed(self, side: int, count: int) -> list[Any]:
         """X^T Omega for each factor X of a side, Omega (rows, count) random combinations of
         rows, every one of which goes into one of them.
         """
-        from scipy import sparse
-
         factors = self.right if side else self.left
-        rows = len(factors[0])
-        order, signs = (
-            self.rng.permutation(rows),
-            self.rng.choice(np.array([-1, 1], factors[0].real.dtype), rows),
-        )
-        combine = sparse.csr_array((signs, (np.arange(rows) % count, order)), (count, rows))
-        return [(combine @ x).T for x in factors]
+        rows = factors[0].shape[0]
+        order, signs = self.rng.permutation(rows), self.rng.choice([-1.0, 1.0], rows)
+        return [_combined(x, order, signs, count) for x in factors]
 
-    def _through_basis(self, q: np.ndarray) -> list[np.ndarray]:
+    def _through_basis(self, q: Any) -> list[Any]:
         """What is seen of M through orthonormal columns q: X_a^T q* for each factor where M is
         symmetric, else M^T q* alone.
         """
-        turned = q.conj()
+        turned = self.device.xp.conj(q)
         seen = [x.T @ turned for x in self.left]
         return seen if self.symmetric else [self._times(1, seen)]
 
-    def _extend(
-        self, q: np.ndarray | None, seen: list[np.ndarray] | None, count: int
-    ) -> tuple[np.ndarray, list[np.ndarray]]:
+    def _extend(self, q: Any | None, seen: list[Any] | None, count: int) -> tuple[Any, list[Any]]:
         """The basis q of M's range (None: not begun) with columns added up to `count`, and what
         is seen of M through it.
         """
@@ -112,17 +113,16 @@ class Product:
         if q is None or seen is None or count >= self.limit:
             q = orthonormal(self._times(0, self._mixed(1, count)))
             return q, self._through_basis(q)
-        columns = self._times(0, self._mixed(1, count - q.shape[1]))
+        xp, columns = self.device.xp, self._times(0, self._mixed(1, count - q.shape[1]))
         for _ in range(2):
-            columns -= q @ (q.conj().T @ columns)
+            columns -= q @ (_adjoint(q) @ columns)
         new = orthonormal(columns)
         # what was numerically nothing is no direction of its own
-        new = orthonormal(new - q @ (q.conj().T @ new))
-        return np.hstack([q, new]), [
-            np.hstack(pair) for pair in zip(seen, self._through_basis(new))
-        ]
+        new = orthonormal(new - q @ (_adjoint(q) @ new))
+        added = [xp.concat(pair, axis=1) for pair in zip(seen, self._through_basis(new))]
+        return xp.concat([q, new], axis=1), added
 
-    def _core(self, q: np.ndarray, seen: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    def _core(self, q: Any, seen: list[Any]) -> tuple[Any, Any]:
         """(P, K) with Q Q^H M = Q K P^T, P orthonormal and Q where M is symmetric."""
         if self.symmetric:
             return q, sum(o.T @ c for o, c in zip(seen, self._through(0, seen)))
@@ -142,16 +142,16 @@ class Product:
         Returns (H, B).
         Raises NumericsError where no sketch of MAX_SKETCH columns holds M.
         """
-        most = min(self.limit, MAX_SKETCH)
+        most, xp, home = min(self.limit, MAX_SKETCH), self.device.xp, self.device.get
         size, q, seen = min(count, most), None, None
         while True:
             q, seen = self._extend(q, seen, size)
             p, core = self._core(q, seen)
-            u, s, vh = np.linalg.svd(core)
-            root = np.sqrt(s)
-            high, wide = q @ (u * root), p @ (vh.T * root)
-            terms = max(terms_within(s, cut), _terms_of_all(high, wide, worst))
-            u, v = u[:, :terms] * root[:terms], vh[:terms].T * root[:terms]
+            u, s, vh = xp.linalg.svd(core, full_matrices=False)
+            root = xp.sqrt(s)
+            high, wide = home(q @ (u * root)), home(p @ (vh.T * root))
+            terms = max(terms_within(home(s), cut), _terms_of_all(high, wide, worst))
+            u, v = u[:, :terms] * root[:terms], vh[:terms, :].T * root[:terms]
             if size >= self.limit or (
                 terms <= FILL * size and self._missed(q, u @ v.T, p) <= 2 * cut
             ):
@@ -172,7 +172,7 @@ class Product:
         Returns (X, Y, K), X orthonormal and Y = X where M is symmetric; None where M does not have
         so few terms, or its factors have few enough.
         """
-        given = sum(x.shape[1] for x in self.left)
+        given, home = sum(x.shape[1] for x in self.left), self.device.get
         count = given // NARROW
         if given <= SMALL or count >= self.limit:
             return None
@@ -181,12 +181,13 @@ class Product:
             return None
         x = orthonormal(self._times(0, directions))
         seen = self._through_basis(x)
-        y, core = (
-            self._core(x, seen) if self.symmetric else (seen[0], np.eye(x.shape[1], dtype=x.dtype))
-        )
-        return (x, y, core) if self._missed(x, core, y) <= 2 * cut else None
+        y, core = self._core(x, seen) if self.symmetric else (seen[0], _like(x, np.eye(x.shape[1])))
+        if self._missed(x, core, y) > 2 * cut:
+            return None
+        here = home(x)
+        return here, here if y is x else home(y), home(core)
 
-    def _directions(self, cut: float, count: int) -> tuple[list[np.ndarray], int]:
+    def _directions(self, cut: float, count: int) -> tuple[list[Any], int]:
         """Combinations of M's columns that span its range up to `cut`, as X_b^T times them for each
         factor, and the terms that M has; no more than `count` of either. Found where M is small:
         through random combinations of its rows and of its columns, OVER times as many.
@@ -196,28 +197,28 @@ class Product:
         left = right if self.symmetric else self._mixed(0, many)
         core = sum(m.T @ c for m, c in zip(left, self._through(0, right)))
         # a step of a power iteration, which parts large values from small ones
-        basis = orthonormal(
-            core @ self.rng.choice(np.array([-1, 1], core.real.dtype), (many, count))
-        )
-        basis = orthonormal(core.conj().T @ basis)
+        linalg = self.device.xp.linalg
+        basis = orthonormal(core @ _like(core, self.rng.choice([-1.0, 1.0], (many, count))))
+        basis = orthonormal(_adjoint(core) @ basis)
         image = core @ basis
-        rest = np.linalg.norm(core - image @ basis.conj().T)
-        _, s, vh = np.linalg.svd(_triangle(image)[1])
+        rest = float(linalg.matrix_norm(core - image @ _adjoint(basis)))
+        _, s, vh = linalg.svd(_triangle(image)[1], full_matrices=False)
         # the k largest also fit what is random here, so that less than all of the rest is seen
         share = 1 - np.arange(count) * (1 / many - 1 / self.limit)
-        terms = terms_within(s, cut * share, rest)
-        basis = basis @ vh[: int(terms / FILL) + 8].conj().T
+        terms = terms_within(self.device.get(s), cut * share, rest)
+        basis = basis @ _adjoint(vh[: int(terms / FILL) + 8, :])
         return [m @ basis for m in right], terms
 
-    def _missed(self, x: np.ndarray, core: np.ndarray, y: np.ndarray) -> float:
+    def _missed(self, x: Any, core: Any, y: Any) -> float:
         """Root sum of squares of M - X K Y^T, estimated on random entries."""
-        rows, columns = (self.rng.integers(0, len(x[0]), 64) for x in (self.left, self.right))
-        exact = sum(
-            a[rows] @ c
-            for a, c in zip(self.left, self._through(0, [b[columns].T for b in self.right]))
-        )
-        difference = exact - x[rows] @ core @ y[columns].T
-        return float(np.sqrt((np.abs(difference) ** 2).mean() * len(x) * len(y)))
+        xp, sides = self.device.xp, (self.left, self.right)
+        rows, columns = (beside(x, self.rng.integers(0, side[0].shape[0], 64)) for side in sides)
+        some = [xp.take(b, columns, axis=0).T for b in self.right]
+        pairs = zip(self.left, self._through(0, some))
+        exact = sum(xp.take(a, rows, axis=0) @ c for a, c in pairs)
+        told = xp.take(x, rows, axis=0) @ core @ xp.take(y, columns, axis=0).T
+        mean = float(xp.mean(xp.abs(exact - told) ** 2))
+        return math.sqrt(mean * x.shape[0] * y.shape[0])
 
 
 def _terms_of_all(high: np.ndarray, wide: np.ndarray, worst: np.ndarray | None) -> int:
@@ -263,13 +264,43 @@ def thin(matrix: np.ndarray) -> Matrix:
     )
 
 
-def orthonormal(columns: np.ndarray) -> np.ndarray:
+def _put_thin(device: Device, matrix: Matrix) -> Any:
+    """A coupling where a device has its arrays: `thin` in NumPy's, whole in those of others."""
+    if device.xp is np:
+        return thin(matrix)
+    return device.put(matrix if isinstance(matrix, np.ndarray) else matrix.toarray())
+
+
+def _combined(x: Any, order: np.ndarray, signs: np.ndarray, count: int) -> Any:
+    """(term, combination): rows of x in an `order` and with `signs`, each `count`th added up.
+
+    x: (row, term).
+    """
+    xp, rows = namespace(x), len(order)
+    whole = -(-rows // count) * count
+    signs, order = np.pad(signs, (0, whole - rows)), np.pad(order, (0, whole - rows))
+    mixed = xp.take(x, beside(x, order), axis=0) * _like(x, signs[:, None])
+    return xp.sum(xp.reshape(mixed, (-1, count, x.shape[1])), axis=0).T
+
+
+def _like(array: Any, values: np.ndarray) -> Any:
+    """Values of NumPy where an array is, of its type."""
+    return namespace(array).asarray(beside(array, values), dtype=array.dtype)
+
+
+def _adjoint(matrix: Any) -> Any:
+    return namespace(matrix).conj(matrix).T
+
+
+def orthonormal(columns: Any) -> Any:
     """An orthonormal basis of the columns."""
     return _triangle(columns)[0]
 
 
-def _triangle(columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _triangle(columns: Any) -> tuple[Any, Any]:
     """(Q, R) with columns = Q R, Q orthonormal, R triangular."""
+    if not isinstance(columns, np.ndarray):
+        return tuple(namespace(columns).linalg.qr(columns))
     from scipy.linalg import qr
 
     return qr(columns, mode="economic", check_finite=False)

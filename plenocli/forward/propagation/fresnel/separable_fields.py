@@ -12,7 +12,12 @@ squared and summed over the nodes of each pixel before it leaves it.
 
 from __future__ import annotations
 
+from functools import cached_property
+from typing import Any
+
 import numpy as np
+
+from plenocli.base.device import CPU, Device
 
 WORK_BYTES = 1 << 22
 """Size of the product before it is squared: small beside the shared cache, large enough that the
@@ -30,7 +35,8 @@ class Factors:
         share of the light that it receives.
     pixel_shape: (rows, columns);
     pixel_nodes: nodes per axis;
-    signs: (terms,) of +-1 that multiply the terms, so that one table may serve as both.
+    signs: (terms,) of +-1 that multiply the terms, so that one table may serve as both;
+    device: where tables are multiplied.
     """
 
     def __init__(
@@ -40,6 +46,7 @@ class Factors:
         pixel_shape: tuple[int, int],
         pixel_nodes: int,
         signs: np.ndarray | None = None,
+        device: Device = CPU,
     ) -> None:
         if (
             high.shape[2] != pixel_nodes * pixel_shape[0]
@@ -56,6 +63,19 @@ class Factors:
         )
         self.pixel_shape, self.pixel_nodes = (pixel_shape[0], pixel_shape[1]), pixel_nodes
         self.signs = None if signs is None else signs.astype(high.real.dtype)
+        self.device = device
+
+    @cached_property
+    def turned(self) -> Factors:
+        """Rows and columns exchanged, of tables without signs."""
+        shape = self.pixel_shape[1], self.pixel_shape[0]
+        return Factors(self.wide, self.high, shape, self.pixel_nodes, device=self.device)
+
+    @cached_property
+    def _there(self) -> tuple[Any, Any]:
+        """Both tables on the device."""
+        wide = self.wide if self.signs is None else self.wide * self.signs
+        return self.device.put(self.high), self.device.put(wide)
 
     def superpixel(
         self, sy: int, sx: int, rows: np.ndarray, columns: np.ndarray, out: np.ndarray
@@ -74,6 +94,9 @@ class Factors:
         order = np.argsort(columns, kind="stable")
         starts = np.flatnonzero(np.diff(columns[order]) > 0) + 1
         for group in np.split(order, starts):
+            if self.device.xp is not np:
+                out[group] = self._elsewhere(sy, sx, rows[group], columns[group[0]])
+                continue
             right = self._right(self.wide[sx, columns[group[0]]])
             for start in range(0, len(group), step):
                 part = group[start : start + step]
@@ -87,6 +110,16 @@ class Factors:
                 parts = product.reshape(len(part), nodes, -1)
                 energy = np.einsum("nqk,nqk->nk", parts, parts)
                 out[part] = np.einsum("nyqx->nyx", energy.reshape(len(part), py, 2 * nodes, px))
+
+    def _elsewhere(self, sy: int, sx: int, rows: np.ndarray, column: int) -> np.ndarray:
+        """(point, pixel row, pixel column) of points of one column, by the device."""
+        xp, put = self.device.xp, self.device.put
+        (py, px), nodes, (high, wide) = self.pixel_shape, self.pixel_nodes, self._there
+        left = xp.take(high[sy, :, :, :], put(rows), axis=0)
+        energy = xp.abs(left @ wide[sx, int(column), :, :].T) ** 2
+        return self.device.get(
+            xp.sum(xp.reshape(energy, (len(rows), nodes, py, nodes, px)), axis=(1, 3))
+        )
 
     def _right(self, factor: np.ndarray) -> np.ndarray:
         """(node, term) complex as the right-hand side of a real product: (term x (real,

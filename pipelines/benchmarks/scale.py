@@ -1,5 +1,5 @@
 """Time, memory and bytes of whole sensors: capture-sim, reconstruct, demux and refocus against
-lenslets, points and workers.
+lenslets, points, workers and device.
 
 Cameras are seed_spatial with more lenslets (`seed`: 52x52 pixels and 40x40 points a lenslet, or
 `small`: 15x15 and 12x12), the scene is the astronaut spread over all lenslets at 50 dB; methods are
@@ -38,6 +38,7 @@ SMALL = {
 }
 BANDS = "450nm", "540nm", "570nm", "650nm"
 WHOLE = 130_000
+ON_DEVICE = "pnp", "auto"
 
 
 def described(kind, lenslets):
@@ -83,6 +84,7 @@ def commands(run, kind, lenslets, chosen):
     for method in chosen.methods:
         out = run / f"{kind}-{count}-{method}.h5"
         options = ["--pif", pif, "--method", method]
+        options += ["--device", chosen.device] if method in ON_DEVICE else []
         command = ["refocus", shot] if method == "refocus" else ["reconstruct", shot, *options]
         yield count, method, [*command, "-o", out, *limits], out
 
@@ -160,6 +162,7 @@ def main():
     parser.add_argument("--workers", type=int, nargs="+", default=[1])
     parser.add_argument("--superpixels", default="1x1", help="that the matrix knows")
     parser.add_argument("--mem-limit", default="2GiB")
+    parser.add_argument("--device", default="cpu", help="of " + " and ".join(ON_DEVICE))
     parser.add_argument("--old", type=Path, help="sources to compare with")
     chosen = parser.parse_args()
     chosen.run.mkdir(parents=True, exist_ok=True)
@@ -174,6 +177,8 @@ def main():
             for workers in chosen.workers if name != "capture-sim" else [1]:
                 shared = [] if workers == 1 else ["--workers", workers]
                 told = f"{name}, {workers} workers" if shared else name
+                elsewhere = name in ON_DEVICE and chosen.device != "cpu"
+                told = f"{told}, {chosen.device}" if elsewhere else told
                 for code, tree in trees.items():
                     about = dict(kind=kind, code=code, command=told, lenslets=count)
                     if any(about.items() <= line.items() for line in lines) and file.exists():

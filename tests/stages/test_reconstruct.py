@@ -1,10 +1,12 @@
 """reconstruct and learn-dict through the command line, on a small camera written down here."""
 
 import json
+import sys
 
 import numpy as np
 import pytest
 
+from plenocli.base.device import CPU, Device
 from plenocli.base.linear_maps import BlockToeplitz
 from plenocli.base.tiling import to_blocks, to_plane
 from plenocli.cli.main import run
@@ -15,6 +17,7 @@ from plenocli.files.artefacts.reading import read_artefact
 from plenocli.files.artefacts.writing import write_artefact
 from plenocli.files.read.scenes import embedded_photograph
 from plenocli.forward.scene.sample import luminance, sample_picture
+from plenocli.stages.inverse.reconstruct import recipe
 
 N, PIXELS, COUNT = 6, 9, 8
 
@@ -525,3 +528,26 @@ def test_an_impossible_output_name_is_an_output_error(single):
         )
         == 4
     )
+
+
+def test_plug_and_play_by_another_library_is_told(single, monkeypatch):
+    folder, _ = single
+    here = reconstruct(folder, "--method", "pnp")
+    library = pytest.importorskip("array_api_strict")
+    another = lambda name: Device("another", library) if name == "cuda" else CPU
+    monkeypatch.setattr(recipe, "device_of", another)
+    there = reconstruct(folder, "--method", "pnp", "--device", "cuda")
+    one, two = (found.data["image/value"] for found in (here, there))
+    assert np.sqrt(np.mean((one - two) ** 2)) < 1e-5
+    told = [found.attrs["image"]["parameters"].get("device") for found in (here, there)]
+    assert told == [None, "another"]
+
+
+def test_a_graphics_card_is_for_what_can_use_it(single, capsys, monkeypatch):
+    folder, _ = single
+    monkeypatch.setitem(sys.modules, "torch", None)  # not installed
+    for method, said in (("lmmse", "use --method pnp"), ("pnp", "PyTorch"), ("auto", "PyTorch")):
+        paths = folder / "capture.h5", "--pif", folder / "pif.h5", "-o", folder / "none.h5"
+        command = ["reconstruct", *map(str, paths), "--method", method, "--device", "cuda"]
+        assert run(command) == 2 and said in capsys.readouterr().err
+    assert not (folder / "none.h5").exists()

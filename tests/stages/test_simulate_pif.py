@@ -9,8 +9,11 @@ import numpy as np
 import pytest
 
 from plenocli.base.budget import Budget, within
+from plenocli.base.device import CPU, Device
 from plenocli.cli.main import run
 from plenocli.files.artefacts.reading import read_artefact
+from plenocli.forward.propagation import system_matrix
+from plenocli.forward.propagation.exact import lenslets
 from tests.peak import PEAK
 from tests.test_architecture import HEAVY
 
@@ -506,3 +509,24 @@ def test_a_matrix_is_computed_without_what_it_does_not_use(tmp_path):
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.splitlines()[-1] == "UNUSED []"
+
+
+def test_an_exact_matrix_by_another_library_is_told(tmp_path, monkeypatch, capsys):
+    library = pytest.importorskip("array_api_strict")
+    another = lambda name: Device("another", library) if name == "cuda" else CPU
+    for module in (lenslets, system_matrix):
+        monkeypatch.setattr(module, "device", another)
+    exact = ["simulate-pif", str(TINY), "--model", "exact", "--superpixels", "1x3"]
+    found = []
+    for name in ("cpu", "cuda"):
+        path = tmp_path / f"{name}.h5"
+        assert run([*exact, "--accuracy", "1e-2", "--device", name, "-o", str(path)]) == 0
+        found.append(read_artefact(path))
+    one, two = (artefact.data["pif/A"] for artefact in found)
+    energy = np.sqrt(np.sum(one.astype(float) ** 2, axis=(1, 2)))
+    assert (np.sqrt(np.sum((one - two).astype(float) ** 2, axis=(1, 2))) < 1e-5 * energy).all()
+    assert [a.attrs["pif"]["notes"].get("device") for a in found] == [None, "another"]
+    capsys.readouterr()
+    rays = ["simulate-pif", str(TINY), "--model", "fresnel", "--device", "cuda"]
+    assert run([*rays, "-o", str(tmp_path / "paraxial.h5")]) == 0
+    assert "computed on the processor" in capsys.readouterr().err

@@ -4,6 +4,7 @@ are most likely, whatever their objects are.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import TYPE_CHECKING
@@ -55,7 +56,8 @@ all the same: so much is gained on the way from a camera that is mirrored along 
 """
 CLEAR = 4.0
 """Steps over lenslet borders under the mirrored camera, over those under the found one, from which
-on a fit that leaves more than its noise is believed: where both fit badly the camera is a third.
+on a fit that leaves more than its noise is believed altogether, and less of it before: where both
+fit badly the camera is a third.
 """
 INFLATION = 1.8
 """By how much the standard deviations exceed the curvature's: drawn cameras were farther by it."""
@@ -133,9 +135,7 @@ def fit_camera(
     turned = None
     if best.evidence.noise_factor() <= limits[1]:
         best, turned = _told_apart(ascent, best, problem.captures)
-    # what is left over beyond the noise is believed of fine objects only where pictures go on
-    sure = turned is not None and turned >= CLEAR
-    return _described(ascent, best, limits[1] if sure else limits[0], begun, turned)
+    return _described(ascent, best, believed_ratio(limits, turned), begun, turned)
 
 
 def _mended(
@@ -187,6 +187,17 @@ def accepted_ratios(values: int, quiet: float) -> tuple[float, float]:
     """
     sure = DEVIATIONS / float(np.sqrt(2 * values))
     return 1 + CERTAIN + sure, float(np.hypot(1 + SLACK, UNRESOLVED * quiet)) + sure
+
+
+def believed_ratio(limits: tuple[float, float], turned: float | None) -> float:
+    """Most likely noise over the noise told up to which the best fit is accepted: what is left over
+    is believed of fine objects as far as pictures go on from lenslet to lenslet.
+
+    limits: accepted_ratios;
+    turned: as in CameraFit.
+    """
+    clear = 0.0 if turned is None else math.log(max(1.0, turned)) / math.log(CLEAR)
+    return limits[0] + min(1.0, clear) ** 2 * (limits[1] - limits[0])
 
 
 def _highest(ascent: Ascent, first: Point, limit: float) -> Point:

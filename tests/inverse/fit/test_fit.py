@@ -14,7 +14,7 @@ from plenocli.files.config.camera_file import parse_camera, to_toml
 from plenocli.forward.camera.geometry import geometry
 from plenocli.forward.propagation.system_matrix import build_pif
 from plenocli.inverse.fit.captures import tell_rotation
-from plenocli.inverse.fit.fit import accepted_ratios, fit_camera
+from plenocli.inverse.fit.fit import accepted_ratios, believed_ratio, fit_camera
 from plenocli.inverse.fit.optics import CameraFamily, all_parameters
 from plenocli.inverse.fit.problem import CapturedLenslets
 from tests.forward.propagation.cameras import WAVELENGTH, accuracy, small_camera
@@ -185,6 +185,15 @@ def test_few_pixels_and_quiet_captures_may_look_noisier():
     assert 1.2 < near < far < near + 0.01
     near, far = accepted_ratios(10**6, 1000.0)
     assert 1.005 < near < 1.01 < 1.02 < far < 1.15
+
+
+def test_what_is_left_over_is_believed_as_far_as_pictures_go_on():
+    limits = 1.01, 1.09
+    believed = [believed_ratio(limits, turned) for turned in (None, 0.5, 1.0, 1.5, 3.3, 4.0, 20.0)]
+    assert believed == sorted(believed)
+    assert believed[:3] == [1.01] * 3 and believed[-2:] == [pytest.approx(1.09)] * 2
+    # where a mirrored camera does all but as well, little; the draw that was refused left 1.0128
+    assert believed[3] < 1.02 and 1.05 < believed[4] < 1.08
 
 
 def test_a_grid_that_is_turned_is_said():

@@ -176,15 +176,18 @@ class BlockCirculant:
         return self.device.put(self.spectrum)
 
     @staticmethod
-    def needed(pixels: int, unknowns: int, torus: tuple[int, int], itemsize: int = 4) -> int:
-        """Bytes of a spectrum, and of making it.
+    def needed(
+        pixels: int, unknowns: int, torus: tuple[int, int], itemsize: int = 4
+    ) -> tuple[int, int]:
+        """Bytes of a spectrum, and those that making it takes beside it.
 
         pixels, unknowns: of a lenslet.
         torus: (rows, columns) of lenslets.
         itemsize: of the kernels' numbers.
         """
         frequencies = torus[0] * (torus[1] // 2 + 1)
-        return 2 * itemsize * pixels * unknowns * frequencies + 4 * CHUNK
+        kernels = itemsize * pixels * unknowns * torus[0] * torus[1]
+        return 2 * itemsize * pixels * unknowns * frequencies, 4 * min(CHUNK, kernels)
 
     def _transform(self, blocks: np.ndarray, offsets: np.ndarray, unknowns: slice) -> None:
         """Fill the columns of a part: rows of pixels at a time, as many as CHUNK has room for."""

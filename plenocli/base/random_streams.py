@@ -15,3 +15,10 @@ def stream(seed: int, stage: str, index: int = 0) -> np.random.Generator:
     index: of the draw, where a stage has several.
     """
     return np.random.default_rng(np.random.SeedSequence([seed, index, *stage.encode()]))
+
+
+def skip(draw: np.random.Generator, count: int) -> None:
+    """Leave out the next `count` numbers that `draw.random` would give."""
+    bits = draw.bit_generator
+    assert isinstance(bits, np.random.PCG64)
+    bits.advance(count)

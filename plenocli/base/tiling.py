@@ -92,7 +92,19 @@ class InParts:
 
     def whole(self) -> np.ndarray:
         """All of it, in memory."""
-        return np.concatenate(list(self.parts())).reshape(self.shape).astype(self.dtype, copy=False)
+        out = np.empty(self.shape, self.dtype)
+        self.put_into(out)
+        return out
+
+    def put_into(self, out: np.ndarray) -> None:
+        """All of it into an array of its shape, of which planes are views."""
+        planes, at, height = out.reshape(-1, *self.shape[-2:]), 0, self.shape[-2]
+        for part in self.parts():
+            plane, row = divmod(at, height)
+            planes[plane, row : row + len(part)] = part
+            at += len(part)
+        if at != len(planes) * height:
+            raise ValueError(f"{at} rows are not those of {self.shape}")
 
 
 EVERYTHING = slice(None)

@@ -1,11 +1,13 @@
-"""Pictures that are made in bands of rows and may not fit the memory: in a nameless file until they
-are written.
+"""Pictures that are made bit by bit and may not fit the memory: in a nameless file until they are
+written.
 """
 
 from __future__ import annotations
 
 import contextlib
+import errno
 import math
+import os
 import tempfile
 import weakref
 from collections.abc import Iterator
@@ -17,7 +19,7 @@ from typing import IO, Any
 import numpy as np
 
 from plenocli.base.errors import OutputError
-from plenocli.base.tiling import BAND, InParts, bands
+from plenocli.base.tiling import BAND, EVERYTHING, InParts, bands
 from plenocli.files.atomic import write_at
 
 DTYPE = np.dtype(np.float32)
@@ -25,8 +27,9 @@ DTYPE = np.dtype(np.float32)
 
 @dataclass(frozen=True, kw_only=True)
 class ScratchRows(InParts):
-    """InParts into which rows of the last two axes are put first, in any order, by an index that
-    ends with a slice of rows. Errors as Scratch.
+    """InParts of which rows of the last two axes are put and looked at first, in any order, by an
+    index that ends with a slice of rows, or of rows and of columns; zero where nothing was put.
+    Errors as Scratch.
 
     scratch: where they are.
     begin: byte of its file.
@@ -36,13 +39,35 @@ class ScratchRows(InParts):
     begin: int
 
     def __setitem__(self, index: Any, values: np.ndarray) -> None:
-        *lead, rows = index if isinstance(index, tuple) else (index,)
-        numbers = np.arange(math.prod(self.shape[:-2])).reshape(self.shape[:-2])[tuple(lead)]
-        planes = np.ascontiguousarray(values, DTYPE).reshape(numbers.size, -1, self.shape[-1])
-        for number, plane in zip(numbers.ravel(), planes):
-            first = (int(number) * self.shape[-2] + rows.start) * self.shape[-1]
+        shape, runs = self._runs(index)
+        whole = np.broadcast_to(np.asarray(values, DTYPE), shape)
+        lines = np.ascontiguousarray(whole).reshape(len(runs), -1)
+        for first, line in zip(runs, lines):
             with self.scratch.told():
-                write_at(self.scratch.file.fileno(), self.begin + first * DTYPE.itemsize, plane)
+                write_at(self.scratch.file.fileno(), first, line)
+
+    def __getitem__(self, index: Any) -> np.ndarray:
+        shape, runs = self._runs(index)
+        values = np.empty(shape, DTYPE)
+        for first, line in zip(runs, values.reshape(len(runs), -1)):
+            self.scratch.read_into(line, first)
+        return values
+
+    def _runs(self, index: Any) -> tuple[tuple[int, ...], list[int]]:
+        """The shape of what an index means, and the byte where each run of it begins in the file,
+        all of one length: rows that are whole lie one after the other.
+        """
+        sides = [*index] if isinstance(index, tuple) else [index]
+        if len(sides) < len(self.shape):
+            sides.append(EVERYTHING)
+        *lead, rows, columns = sides
+        height, width = self.shape[-2:]
+        planes = np.arange(math.prod(self.shape[:-2])).reshape(self.shape[:-2])[tuple(lead)]
+        (top, bottom, _), (left, right, _) = rows.indices(height), columns.indices(width)
+        starts = np.arange(top, bottom) if right - left < width else np.arange(top, bottom)[:1]
+        lines = np.add.outer(planes.ravel() * height, starts).ravel() * width + left
+        shape = *planes.shape, bottom - top, right - left
+        return shape, (self.begin + lines * DTYPE.itemsize).tolist()
 
 
 class Scratch:
@@ -62,17 +87,28 @@ class Scratch:
     def __call__(self, shape: tuple[int, ...]) -> ScratchRows:
         begin = self._size
         self._size += math.prod(shape) * DTYPE.itemsize
+        with self.told():
+            os.ftruncate(self.file.fileno(), self._size)
         parts = partial(self._read, shape, begin)
         return ScratchRows(shape=shape, dtype=DTYPE, parts=parts, scratch=self, begin=begin)
 
     def _read(self, shape: tuple[int, ...], begin: int) -> Iterator[np.ndarray]:
-        self.file.seek(begin)
         for _ in range(math.prod(shape[:-2])):
             for rows in bands(shape[-2], BAND // shape[-1]):
-                count = (rows.stop - rows.start) * shape[-1]
-                with self.told():
-                    values = np.frombuffer(self.file.read(count * DTYPE.itemsize), DTYPE)
-                yield values.reshape(-1, shape[-1])
+                values = np.empty((rows.stop - rows.start, shape[-1]), DTYPE)
+                self.read_into(values, begin)
+                begin += values.nbytes
+                yield values
+
+    def read_into(self, values: np.ndarray, begin: int) -> None:
+        """Fill an array, C-ordered, with what is in the file from a byte on."""
+        view = values.data.cast("B")
+        with self.told():
+            while view:
+                done = os.preadv(self.file.fileno(), [view], begin)
+                if not done:
+                    raise OSError(errno.EIO, "it was cut short")
+                view, begin = view[done:], begin + done
 
     @contextlib.contextmanager
     def told(self) -> Iterator[None]:

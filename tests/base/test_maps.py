@@ -79,8 +79,7 @@ def test_single_precision_stays_single():
     assert op.spectrum.dtype == np.complex64 and double.spectrum.dtype == np.complex128
     assert op.forward(x).dtype == np.float32 and op.adjoint(op.forward(x)).dtype == np.float32
     np.testing.assert_allclose(op.forward(x), double.forward(x), atol=1e-5)
-    needed = BlockCirculant.needed(5, 7, (5, 7), 4) - BlockCirculant.needed(0, 0, (5, 7), 4)
-    assert needed == op.spectrum.nbytes
+    assert BlockCirculant.needed(5, 7, (5, 7), 4)[0] == op.spectrum.nbytes
 
 
 @pytest.mark.parametrize("torus", [(4, 9), (9, 5)])

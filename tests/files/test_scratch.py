@@ -27,6 +27,25 @@ def test_rows_put_in_any_order_come_out_as_an_array_has_them(monkeypatch, tmp_pa
     assert not list(tmp_path.iterdir())
 
 
+def test_parts_of_rows_are_put_and_added_to_as_in_an_array(tmp_path):
+    """Windows that overlap, of which some places are never put."""
+    rng, room = np.random.default_rng(6), Scratch(tmp_path / "out.h5")
+    room((2, 3))
+    kept, array = room((4, 3, 9, 8)), np.zeros((4, 3, 9, 8), np.float32)
+    windows = [
+        (slice(None), slice(None), slice(2, 7), slice(1, 5)),
+        (slice(1, 3), slice(0, 2), slice(0, 4), slice(3, 8)),
+        (3, slice(None), slice(6, 9), slice(0, 8)),
+        (2, 1, slice(1, 9)),
+    ]
+    for window in windows:
+        values = rng.normal(size=array[window].shape).astype(np.float32)
+        array[window] += values
+        kept[window] += values
+        np.testing.assert_array_equal(kept[window], array[window])
+    np.testing.assert_array_equal(kept.whole(), array)
+
+
 def test_a_file_that_cannot_be_made_or_written_is_an_output_error(monkeypatch, tmp_path):
     with pytest.raises(OutputError, match="its pictures cannot be kept beside it"):
         Scratch(tmp_path / "gone" / "out.h5")

@@ -16,6 +16,7 @@ import numpy as np
 from plenocli import __version__
 from plenocli.base.budget import budget
 from plenocli.base.errors import InputError, PlenoError
+from plenocli.base.tiling import InParts
 from plenocli.files.outside import outside
 from plenocli.files.seal import SEAL, publish_sealed, require_seal
 
@@ -90,7 +91,7 @@ def write_ome_tiff(
     digest = hashlib.sha256()
     planes = [np.ascontiguousarray(one.values, dtype=np.float32) for one in series]
     for values in planes:
-        digest.update(values.tobytes())
+        digest.update(values.reshape(-1).data)
     # else it has the clock and the machine in it
     name = uuid.uuid5(uuid.NAMESPACE_OID, digest.hexdigest()).urn
     memory = BytesIO()
@@ -108,8 +109,8 @@ def write_ome_tiff(
 
 def write_volume_tiff(
     path: str | os.PathLike,
-    value: np.ndarray,
-    sigma: np.ndarray | None,
+    value: np.ndarray | InParts,
+    sigma: np.ndarray | InParts | None,
     depth: np.ndarray,
     spacing: tuple[float, float],
     *,
@@ -124,9 +125,17 @@ def write_volume_tiff(
     """
     both = [value] if sigma is None else [value, sigma]
     names = ["volume", "sigma"][: len(both)]
+    planes, rows, columns = value.shape
+    values = np.empty((planes, len(both), rows, columns), np.float32)
+    for channel, part in enumerate(both):
+        own = values[:, channel]
+        if isinstance(part, InParts):
+            part.put_into(own)
+        else:
+            own[:] = part
     one = Series(
         name="volume",
-        values=np.stack(both, axis=1),
+        values=values,
         channels=names,
         spacing=spacing,
         positions=np.asarray(depth, float),

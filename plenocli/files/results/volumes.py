@@ -9,11 +9,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from plenocli.base.errors import InputError
+from plenocli.base.tiling import EVERYTHING, InParts
 from plenocli.evaluation.metrics.volume import VolumeScore, score_volume
 
 if TYPE_CHECKING:
     from plenocli.files.artefacts.container import Artefact
     from plenocli.files.artefacts.provenance import Provenance
+    from plenocli.files.artefacts.reading import Stored
     from plenocli.forward.volume.stack import Stack
     from plenocli.inverse.volume.volume import Volume
 
@@ -25,12 +27,12 @@ SAME = 1e-3
 class StoredVolume:
     """What a file says of a volume.
 
-    value: (plane, row, column); sigma, opacity: likewise, or None.
+    value: (plane, row, column), may be PlanesInFile; sigma, opacity: likewise, or None.
     depth: (plane,) m; spacing: (rows, columns) m, mean over planes.
     facts: name of an attribute -> its value, those of held-out pixels with "held_out." before them.
     """
 
-    value: np.ndarray
+    value: Any
     sigma: np.ndarray | None
     opacity: np.ndarray | None
     depth: np.ndarray
@@ -56,7 +58,7 @@ class StoredVolume:
 
 
 def truth_artefact(
-    value: np.ndarray,
+    value: np.ndarray | InParts,
     depth: np.ndarray,
     spacing: np.ndarray,
     provenance: Provenance,
@@ -64,13 +66,14 @@ def truth_artefact(
 ) -> Artefact:
     """The artefact of a volume that is known.
 
-    value: (plane, row, column); depth: (plane,) m; spacing: (plane, 2) m, rows and columns.
+    value: (plane, row, column), may be InParts; depth: (plane,) m; spacing: (plane, 2) m, rows and
+        columns.
     opacity: like value, of opaque layers.
     """
     from plenocli.files.artefacts.container import Artefact
 
     data = {
-        "volume/value": value.astype(np.float32),
+        "volume/value": _single(value),
         "volume/depth": np.asarray(depth, float),
         "volume/spacing": np.asarray(spacing, float),
     }
@@ -92,7 +95,7 @@ def volume_artefact(
     """
     made = truth_artefact(volume.value, depth, spacing, provenance)
     if volume.sigma is not None:
-        made.data["volume/sigma"] = volume.sigma.astype(np.float32)
+        made.data["volume/sigma"] = _single(volume.sigma)
     about: dict[str, Any] = {
         "method": volume.method,
         "trace": [[trial.what, trial.misfit] for trial in volume.trace],
@@ -127,21 +130,61 @@ def volume_artefact(
     return made
 
 
-def read_volume(path: Path | str) -> StoredVolume:
+def _single(values: np.ndarray | InParts) -> np.ndarray | InParts:
+    """In single precision."""
+    return values if isinstance(values, InParts) else values.astype(np.float32)
+
+
+def read_volume(path: Path | str, *, in_file: bool = False) -> StoredVolume:
     """The volume in a file of kind volume.
+
+    in_file: whether a value that is not small stays in its file, of which slices of rows and
+        columns are read; sigma and opacity are not wanted then.
 
     Raises InputError for another file.
     """
-    from plenocli.files.artefacts.reading import read_artefact
+    from plenocli.files.artefacts.reading import opened_artefact, read_artefact
 
-    return volume_of(read_artefact(path, "volume"))
+    if not in_file:
+        return volume_of(read_artefact(path, "volume"))
+    beside, value = ("volume/sigma", "volume/opacity"), "volume/value"
+    with opened_artefact(path, "volume", beside, large=(value,)) as (artefact, stored):
+        if value in stored:
+            there = stored[value]
+            artefact.data[value] = PlanesInFile(there, np.arange(there.shape[0]))
+        return volume_of(artefact)
+
+
+@dataclass(frozen=True)
+class PlanesInFile:
+    """Planes of a volume that stays in its file, by their numbers, looked at by slices (every
+    plane, rows, columns). Errors as Stored.part.
+    """
+
+    stored: Stored
+    numbers: np.ndarray
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """(planes, rows, columns)."""
+        return len(self.numbers), *self.stored.shape[1:]
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+    def __getitem__(self, index: Any) -> Any:
+        """Values of slices of all three axes; for numbers, these planes, in the file."""
+        if isinstance(index, np.ndarray):
+            return PlanesInFile(self.stored, self.numbers[index])
+        planes, *sides = index
+        return self.stored.part(EVERYTHING, *sides)[self.numbers[planes]]
 
 
 def same_voxels(
     volume: StoredVolume, stack: Stack, lenslets: tuple[int, int], path: Path | str
-) -> np.ndarray:
+) -> Any:
     """A volume on the voxels of kernels before `lenslets` cells: (plane, row, column), of its
-    planes those that the kernels have.
+    planes those that the kernels have, in its file where it was.
 
     Raises InputError, which names `path`, where it has other voxels.
     """

@@ -95,7 +95,7 @@ def require_room(optics: VolumeOptics, plan: VolumePlan, count: tuple[int, int])
     widest = torus_for(count, (max(plan.reach),) * 2)
     per_plane = 4 * pixels * many * (2 * max(plan.reach) + 1) ** 2
     budget().require(
-        4 * per_plane + BlockCirculant.needed(pixels, many, widest),
+        4 * per_plane + sum(BlockCirculant.needed(pixels, many, widest)),
         "recording this volume",
         "lenslet_array.count",
         "take fewer lenslets or voxels",

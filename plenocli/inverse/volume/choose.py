@@ -65,16 +65,22 @@ def volume_of(problem: Problem, method: str = "auto", like: np.ndarray | None = 
     return replace(best, trace=(*tried, *best.trace))
 
 
-def volume_of_part(problem: Problem, other: Volume, like: np.ndarray | None = None) -> Volume:
-    """The volume behind another part of the same specimen, by the method of `other`; its error bars
-    follow the specimen where those of `other` do, else they would jump from part to part.
+def as_before(other: Volume) -> Callable[[Problem, np.ndarray | None], Volume]:
+    """What makes the volumes behind other parts of the same specimen, by the method of `other`;
+    their error bars follow the specimen where those of `other` do, else they would jump from part
+    to part.
 
-    like: as in volume_of, of this part.
+    Returns a function of a part's problem and its `like`, as in volume_of.
     """
-    if like is not None:
-        return total_variation(problem, like=like)
+    method = other.method
     linear = {} if other.sigma is None else {"uneven": is_uneven(other.value)}
-    return SOLVERS[other.method](problem, **linear)
+
+    def of(problem: Problem, like: np.ndarray | None) -> Volume:
+        if like is not None:
+            return total_variation(problem, like=like)
+        return SOLVERS[method](problem, **linear)
+
+    return of
 
 
 def supported_planes(

@@ -3,6 +3,7 @@ darkest ones."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -33,25 +34,57 @@ def haze(measurement: Measurement) -> np.ndarray:
     lenslets are known whole.
     """
     pixels = measurement.signal.shape[2]
-    signal = measurement.signal.reshape(-1, pixels)
-    usable = np.ones(signal.shape, bool)
-    if measurement.usable is not None:
-        usable = measurement.usable.reshape(-1, pixels)
-    known = usable.sum(axis=1)
+    ever, counts = np.zeros(pixels, bool), []
+    for part in measurement.in_bands():
+        usable = np.isfinite(part)
+        ever |= usable.any(axis=0)
+        counts.append(usable.sum(axis=1))
+    known = np.concatenate(counts)
     # a colour's pixels are now a few more, now a few less of a superpixel's
     whole = known >= WHOLE * known.max()
-    # pixels at the pupil's edge count behind no lenslet
-    usable = (usable | ~usable.any(axis=0))[whole]
-    signal = np.where(usable, signal[whole], 0)
-    count = max(FEWEST, int(DARKEST * len(signal)))
-    if len(signal) < 4 * FEWEST:
+    if whole.sum() < 4 * FEWEST:
         return np.zeros(pixels)
-    usual = signal.sum(axis=0) / np.maximum(usable.sum(axis=0), 1)
-    level = signal.sum(axis=1) / np.maximum(usable @ usual, np.finfo(float).tiny)
-    darkest = np.argsort(level, kind="stable")[:count]
-    seen = usable[darkest].sum(axis=0)
-    mean = signal[darkest].sum(axis=0) / np.maximum(seen, 1)
+    # pixels at the pupil's edge count behind no lenslet
+    light, seen = _sums(measurement, whole, ever)
+    usual = light / np.maximum(seen, 1)
+    level = np.full(len(whole), np.inf)
+    for numbers, signal, usable in _chosen(measurement, whole, ever):
+        level[numbers] = signal.sum(axis=1) / np.maximum(usable @ usual, np.finfo(float).tiny)
+    count = max(FEWEST, int(DARKEST * whole.sum()))
+    darkest = np.zeros(len(whole), bool)
+    darkest[np.argsort(level, kind="stable")[:count]] = True
+    light, seen = _sums(measurement, darkest, ever)
+    mean = light / np.maximum(seen, 1)
     return KEPT * np.maximum(np.where(seen > 0, mean, level[darkest].mean() * usual), 0)
+
+
+def _chosen(
+    measurement: Measurement, chosen: np.ndarray, ever: np.ndarray
+) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Of each band of lenslets: the numbers of those that are chosen (lenslet,), their signal, 0
+    where it is not known, and which pixels count, all those that are known of no lenslet too.
+
+    chosen: (lenslet,) of all; ever: (pixel,) known of some lenslet.
+    """
+    first = 0
+    for part in measurement.in_bands():
+        numbers = np.flatnonzero(chosen[first : first + len(part)])
+        signal = part[numbers].astype(float)
+        known = np.isfinite(signal)
+        signal[~known] = 0
+        yield first + numbers, signal, known | ~ever
+        first += len(part)
+
+
+def _sums(
+    measurement: Measurement, chosen: np.ndarray, ever: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Light (pixel,) of all chosen lenslets, and how many of them count."""
+    light, seen = np.zeros(len(ever)), np.zeros(len(ever), int)
+    for _, signal, usable in _chosen(measurement, chosen, ever):
+        light += signal.sum(axis=0)
+        seen += usable.sum(axis=0)
+    return light, seen
 
 
 def without_haze(problem: Problem, known: np.ndarray) -> Problem:

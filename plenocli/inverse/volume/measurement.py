@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 from plenocli.base.errors import NumericsError
 from plenocli.base.linear_maps import BlockCirculant
-from plenocli.base.random_streams import stream
+from plenocli.base.random_streams import skip, stream
+from plenocli.base.tiling import BAND, bands
 from plenocli.inverse.volume.volume import HeldOut, predictive_sigma
 
 DARK = 1e-2
@@ -22,18 +25,18 @@ SEEN = 0.9
 class Measurement:
     """Superpixels of one exposure.
 
-    signal: (lenslet_row, lenslet_column, pixel), in units of A x.
+    signal: (lenslet_row, lenslet_column, pixel), in units of A x; NaN where a pixel is dead or
+        saturated. What all lenslets see may stay in a file, such as
+        plenocli.files.scratch.ScratchRows; it is looked at window by window.
     read_variance: of every pixel, squared units of the signal.
     gain: variance of the photons' noise over the signal, units of the signal; 0 where the noise
         does not grow with it.
-    usable: like signal, false where a pixel is dead or saturated; None where all count.
     background: signal without any specimen: a number, or (pixel,) for all superpixels.
     """
 
-    signal: np.ndarray
+    signal: Any
     read_variance: float
     gain: float = 0.0
-    usable: np.ndarray | None = None
     background: np.ndarray | float = 0.0
 
     @property
@@ -45,6 +48,16 @@ class Measurement:
     def offset(self) -> np.ndarray:
         """The background of every pixel, like signal; a view."""
         return np.broadcast_to(np.asarray(self.background, float), self.signal.shape)
+
+    def window(self, rows: slice, columns: slice) -> Measurement:
+        """What some of the lenslets see, in memory."""
+        return replace(self, signal=self.signal[rows, columns])
+
+    def in_bands(self) -> Iterator[np.ndarray]:
+        """The signal (lenslet, pixel) of some rows of lenslets after the other."""
+        rows, columns, pixels = self.signal.shape
+        for some in bands(rows, 4 * BAND // (columns * pixels)):
+            yield self.signal[some, :].reshape(-1, pixels)
 
     def variance(self, signal: np.ndarray) -> np.ndarray:
         """Variance of pixels that get `signal` of the specimen, (.., pixel) or a number."""
@@ -85,9 +98,24 @@ class Voxels:
         return parts.reshape(parts.shape[0], parts.shape[1], -1)
 
 
-def lots(seed: int, shape: tuple[int, ...]) -> np.ndarray:
-    """Like a signal of `shape`, 0..1: what decides which pixels are put aside."""
-    return stream(seed, "volume-hold-out").random(shape)
+def put_aside(
+    share: float, seed: int, shape: tuple[int, ...], rows: slice, columns: slice
+) -> np.ndarray:
+    """Which pixels of a window are put aside, like its signal: those that they are in all windows.
+
+    share: of the pixels, 0..1.
+    seed: of the draw.
+    shape: of the signal of all lenslets.
+    rows, columns: of the window.
+    """
+    (top, bottom, _), (left, right, _) = rows.indices(shape[0]), columns.indices(shape[1])
+    lots, line = stream(seed, "volume-hold-out"), shape[1] * shape[2]
+    skip(lots, top * line + left * shape[2])
+    aside = np.empty((bottom - top, right - left, shape[2]), bool)
+    for row in aside:
+        np.less(lots.random(row.shape), share, out=row)
+        skip(lots, line - row.size)
+    return aside
 
 
 class Problem:
@@ -98,7 +126,7 @@ class Problem:
     voxels: of the map's unknowns.
     hold_out: share of the usable pixels that no solver sees.
     seed: of which ones.
-    draw: like the measurement's signal, 0..1, what decides instead: those below `hold_out`.
+    aside: like the measurement's signal, which ones they are, instead.
 
     `signal`, `counts` and `held` are (lenslet_row, lenslet_column, pixel): the specimen's light,
     whether a pixel is fitted, and whether it was put aside.
@@ -113,7 +141,7 @@ class Problem:
         voxels: Voxels,
         hold_out: float = 0.05,
         seed: int = 0,
-        draw: np.ndarray | None = None,
+        aside: np.ndarray | None = None,
     ) -> None:
         if measurement.signal.shape != op.range.shape or voxels.unknowns != op.domain.shape[2]:
             raise ValueError(
@@ -121,17 +149,16 @@ class Problem:
                 f"{measurement.signal.shape} and {voxels.unknowns} unknowns a lenslet"
             )
         self.op, self.measurement, self.voxels = op, measurement, voxels
-        if draw is None:
-            draw = lots(seed, measurement.signal.shape)
-        self._hold_out, self._draw = hold_out, draw
+        if aside is None:
+            everything = slice(None)
+            aside = put_aside(hold_out, seed, measurement.signal.shape, everything, everything)
+        self._aside = aside
         self.signal = (measurement.signal - measurement.offset).astype(op.dtype)
         usable = np.isfinite(self.signal) & (
             self.light_on_pixels > DARK * self.light_on_pixels.max()
         )
-        if measurement.usable is not None:
-            usable &= measurement.usable
         self.signal[~usable] = 0
-        self.held = usable & (draw < hold_out)
+        self.held = usable & aside
         self.counts = usable & ~self.held
         if not self.counts.any():
             raise NumericsError(
@@ -140,7 +167,7 @@ class Problem:
 
     def with_measurement(self, measurement: Measurement) -> Problem:
         """The same with another measurement of the same pixels, the same ones put aside."""
-        return Problem(self.op, measurement, self.voxels, self._hold_out, draw=self._draw)
+        return Problem(self.op, measurement, self.voxels, aside=self._aside)
 
     @cached_property
     def light_on_pixels(self) -> np.ndarray:

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from plenocli.base.errors import InputError, UsageError
 from plenocli.base.text import by
-from plenocli.base.tiling import in_cells, in_lenslets
+from plenocli.base.tiling import BAND, EVERYTHING, bands, in_cells, in_lenslets
 from plenocli.forward.sensor.capture import SuperpixelGrid
 from plenocli.forward.sensor.cfa import cfa_map
 from plenocli.forward.sensor.frames import saturated
@@ -53,6 +54,7 @@ def measured(
     where: str | Path | None = None,
     background: float = 0.0,
     channel: str | None = None,
+    room: Callable[[tuple[int, ...]], Any] = np.empty,
 ) -> Measurement:
     """Superpixels of a capture, one unit of light the mean level of the white image, or what the
     capture calls one.
@@ -66,6 +68,7 @@ def measured(
     background: light without any specimen, in the same unit.
     channel: letter of the colour filter array whose pixels count, each a sample at its own place;
         a grey capture has none.
+    room: for them, of a shape, which takes slices of rows.
 
     Raises InputError where sizes disagree or lenslets are missing, UsageError for a channel that
     the capture does not have, or none of those that it has.
@@ -79,14 +82,37 @@ def measured(
         found = _resampled(capture, shape, stack.lattice, calibration, where, channel)
         even = in_lenslets(stack.even()[None, None], several).mean(axis=(0, 1))
         white = white_superpixel(calibration, shape, stack.lattice, channel)
-        found = _evened(found, white.ravel(), even)
-    usable = np.ones(found.signal.shape, bool) if found.usable is None else found.usable
-    return replace(
-        found,
-        signal=in_cells(found.signal, several),
-        usable=in_cells(usable, several),
-        background=background,
+        found = found.times(_evening(white.ravel(), even))
+    (rows, columns), pixels = found.count, shape[0] * shape[1]
+    signal = room((-(-rows // several), columns, several * pixels))
+    for cells in bands(signal.shape[0], 4 * BAND // (several * columns * pixels)):
+        first, last = cells.start * several, cells.stop * several
+        cut = found.cut(slice(first, min(last, rows)))
+        # what the last row of cells lacks
+        cut = np.pad(cut, ((0, last - first - len(cut)), (0, 0), (0, 0)), constant_values=np.nan)
+        signal[cells, :] = in_cells(cut, several)
+    return Measurement(
+        signal=signal, read_variance=found.read_variance, gain=found.gain, background=background
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Superpixels:
+    """Superpixels in units of the volume's light, cut out when they are asked for.
+
+    count: lenslets (rows, columns).
+    cut: gives those of some rows, (row, column, pixel), NaN where a pixel counts for nothing.
+    read_variance, gain: as of Measurement.
+    """
+
+    count: tuple[int, int]
+    cut: Callable[[slice], np.ndarray]
+    read_variance: float
+    gain: float
+
+    def times(self, factor: np.ndarray) -> _Superpixels:
+        """The same times a factor (pixel,)."""
+        return replace(self, cut=lambda rows: self.cut(rows) * factor)
 
 
 def _asked(capture: Capture, channel: str | None) -> str:
@@ -105,13 +131,13 @@ def _asked(capture: Capture, channel: str | None) -> str:
     return channel
 
 
-def _evened(found: Measurement, white: np.ndarray, even: np.ndarray) -> Measurement:
-    """A measurement in which the white image (pixel,) would be `even`."""
+def _evening(white: np.ndarray, even: np.ndarray) -> np.ndarray:
+    """(pixel,) by what superpixels are multiplied whose white image (pixel,) would be `even`, NaN
+    at the pupil's edge.
+    """
     known = (even > EDGE * even.max()) & (white > EDGE * white.max())
-    factor = np.where(known, even / np.where(known, white, 1.0), 0.0)
-    factor /= np.average(factor[known], weights=white[known])
-    usable = np.ones(found.signal.shape, bool) if found.usable is None else found.usable
-    return replace(found, signal=found.signal * factor, usable=usable & known)
+    factor = np.where(known, even / np.where(known, white, 1.0), np.nan)
+    return factor / np.average(factor[known], weights=white[known])
 
 
 def white_superpixel(
@@ -215,7 +241,7 @@ def _step(calibration: Calibration, shape: tuple[int, int], lattice: str) -> tup
     return down / shape[0], right / shape[1]
 
 
-def _tiled(capture: Capture, shape: tuple[int, int], lattice: str, channel: str) -> Measurement:
+def _tiled(capture: Capture, shape: tuple[int, int], lattice: str, channel: str) -> _Superpixels:
     path = capture.metadata.path
     own, count = (capture.grid.shape, capture.grid.count) if capture.grid else (None, None)
     if own is None or count is None:
@@ -230,24 +256,29 @@ def _tiled(capture: Capture, shape: tuple[int, int], lattice: str, channel: str)
             path,
             "simulate-pif with the description that the capture was made with",
         )
-    signal = capture.signal()
     unit = capture.metadata.electrons_per_unit or 1.0
     unit *= (capture.levels.gain or 1.0) if capture.units == "DN" else 1.0
-    noise, usable = capture.noise, np.isfinite(signal)
-    usable &= cfa_map(signal.shape, capture.cfa) == channel
-    if np.isfinite(capture.levels.white):
-        usable &= ~saturated(capture.mosaic, capture.levels.black, capture.levels.white)
+    noise, (rows, columns) = capture.noise, count
     # whole pixels side by side
-    rows, columns = count
     centre = there(SuperpixelGrid.tiled((rows, columns), shape, lattice).centre)
     origin = np.rint(centre - (np.array(shape) - 1) / 2).astype(int)
-    cut = extract(np.where(usable, signal, np.nan), origin, shape)
-    known = np.isfinite(cut)
-    return Measurement(
-        signal=np.where(known, cut, 0.0) / unit,
+
+    def cut(some: slice) -> np.ndarray:
+        own = origin[some]
+        first, last = int(own[..., 0].min()), int(own[..., 0].max()) + shape[0]
+        seen = capture.window(slice(first, last), EVERYTHING)
+        signal = seen.signal()
+        colours = cfa_map((signal.shape[0], signal.shape[1]), capture.cfa, (first % 2, 0))
+        usable = colours == channel
+        if np.isfinite(seen.levels.white):
+            usable &= ~saturated(seen.mosaic, seen.levels.black, seen.levels.white)
+        return extract(np.where(usable, signal, np.nan), own - (first, 0), shape) / unit
+
+    return _Superpixels(
+        count=(rows, columns),
+        cut=cut,
         read_variance=0.0 if noise is None else noise.without_signal / unit**2,
         gain=0.0 if noise is None else noise.gain / unit,
-        usable=known,
     )
 
 
@@ -258,7 +289,7 @@ def _resampled(
     calibration: Calibration,
     where: str | Path | None,
     channel: str,
-) -> Measurement:
+) -> _Superpixels:
     grid, white = calibration.grid, calibration.white
     step = _step(calibration, shape, lattice)
     corners, bins = _corners(capture.cfa, channel), _bins(step)
@@ -301,14 +332,14 @@ def _resampled(
         even = even / shade[..., None]
         good &= through >= DUST
         cut = cut / through
-    signal = np.where(good, cut, 0.0) / even / usual
+    signal = np.where(good, cut, np.nan) / even / usual
     if lattice == "hexagonal" and _starts_aside(grid.centres):
-        signal, good = (np.pad(a, ((1, 0), (0, 0), (0, 0))) for a in (signal, good))
-    return Measurement(
-        signal=signal,
+        signal = np.pad(signal, ((1, 0), (0, 0), (0, 0)), constant_values=np.nan)
+    return _Superpixels(
+        count=(signal.shape[0], signal.shape[1]),
+        cut=lambda rows: signal[rows],
         read_variance=noise.without_signal / usual**2 / math.prod(bins),
         gain=noise.gain / usual / math.prod(bins),
-        usable=good,
     )
 
 

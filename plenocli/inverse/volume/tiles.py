@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -18,14 +18,22 @@ from plenocli.base.linear_maps import BlockCirculant, torus_for
 from plenocli.base.progress import bar
 from plenocli.forward.volume.stack import Stack
 from plenocli.inverse.volume import total_variation
-from plenocli.inverse.volume.choose import volume_of, volume_of_part
+from plenocli.inverse.volume.choose import as_before, volume_of
 from plenocli.inverse.volume.haze import haze, without_haze
 from plenocli.inverse.volume.lattice import map_of, voxels_of
-from plenocli.inverse.volume.measurement import SEEN, Measurement, Problem, lots
+from plenocli.inverse.volume.measurement import SEEN, Measurement, Problem, put_aside
 from plenocli.inverse.volume.volume import HeldOut, Trial, Volume, predictive_sigma
 
 MOST = 10_000
 """Windows, at most."""
+SPARE = 0.125
+"""Share of the work that smaller windows may take more of: what they take of the memory is then
+much the same for all sensors.
+"""
+HELD_BYTES = 12
+"""Memory for a pixel that was put aside, while windows are worked on."""
+Room = Callable[[tuple[int, ...]], Any]
+"""What gives room for values of a shape, zero at first, which are put and looked at by slices."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,7 +54,7 @@ class Window:
 
 
 class Tiles:
-    """A measurement before kernels, in as few windows as the memory has room for.
+    """A measurement before kernels, in one window or as many as the memory makes necessary.
 
     stack: the kernels.
     measurement: of all lenslets.
@@ -55,7 +63,8 @@ class Tiles:
     seed: of which ones.
     where: the kernels' file, for messages.
     device: of their map.
-    like: (plane, row, column) before all lenslets, as volume_of takes it.
+    like: (plane, row, column) before all lenslets, as volume_of takes it; may stay in a file.
+    room: for the volume, plane by plane, that windows are joined to.
 
     Windows overlap by the lenslets that a voxel's light reaches, and fade into each other there.
     All have the same size, and so the same map.
@@ -73,36 +82,45 @@ class Tiles:
         seed: int,
         where: str | Path | None = None,
         device: Device = CPU,
-        like: np.ndarray | None = None,
+        like: Any = None,
+        room: Room = np.zeros,
     ) -> None:
-        self.device, self.like = device, like
+        self.device, self.like, self.room = device, like, room
         self.stack, self.measurement, self.method = stack, measurement, method
         self._hold_out, self._seed, self._where = hold_out, seed, where
         count = measurement.signal.shape[:2]
         self.windows = _windows(count, self._several(count), _halo(stack))
 
     def _several(self, count: Sequence[int]) -> tuple[int, int]:
-        """Windows along rows and columns: the fewest that fit."""
+        """Windows along rows and columns that fit: one, or of those that are hardly more work than
+        the least the smallest.
+        """
         halo, reach = _halo(self.stack), self.stack.reach
         pixels, unknowns = self.stack.A.shape[1], len(self.stack.depth) * self.stack.A.shape[2]
-        least, best = math.inf, (1, 1)
+        kept = HELD_BYTES * self._hold_out * math.prod(count) * pixels
+        fewest, fitting = math.inf, dict[tuple[int, int], tuple[int, int]]()
         for rows in range(1, count[0] + 1):
             for columns in range(1, count[1] + 1):
-                if rows * columns >= min(least, MOST):
+                if rows * columns > min(2 * fewest, MOST):
                     break
                 size = _size(count[0], rows, halo), _size(count[1], columns, halo)
-                needed = _needed(self.method, pixels, unknowns, torus_for(size, reach))
-                if needed <= budget().memory:
-                    least, best = rows * columns, (rows, columns)
-        if not math.isfinite(least):
+                torus = torus_for(size, reach)
+                if _needed(self.method, pixels, unknowns, torus) + kept <= budget().memory:
+                    fewest = min(fewest, rows * columns)
+                    fitting[rows, columns] = torus
+        if not fitting:
             smallest = _size(count[0], count[0], halo), _size(count[1], count[1], halo)
             budget().require(
-                _needed(self.method, pixels, unknowns, torus_for(smallest, reach)),
+                kept + _needed(self.method, pixels, unknowns, torus_for(smallest, reach)),
                 f"the map of {smallest[0]} x {smallest[1]} lenslets",
                 self._where,
                 "take fewer planes or voxels",
             )
-        return best
+        if fewest == 1:
+            return 1, 1
+        areas = {several: math.prod(torus) for several, torus in fitting.items()}
+        most = (1 + SPARE) * min(math.prod(several) * area for several, area in areas.items())
+        return min((s for s in areas if math.prod(s) * areas[s] <= most), key=areas.__getitem__)
 
     @cached_property
     def _op(self) -> BlockCirculant:
@@ -110,27 +128,17 @@ class Tiles:
         size = len(window.row_weight), len(window.column_weight)
         return map_of(self.stack, size, self.device)
 
-    @cached_property
-    def _draw(self) -> np.ndarray:
-        return lots(self._seed, self.measurement.signal.shape)
-
     def problem(self, window: Window) -> Problem:
         """What is seen in one window."""
         at = window.rows, window.columns
-        whole = self.measurement
-        part = replace(
-            whole,
-            signal=whole.signal[at],
-            usable=None if whole.usable is None else whole.usable[at],
-        )
-        return Problem(self._op, part, voxels_of(self.stack), self._hold_out, draw=self._draw[at])
+        aside = put_aside(self._hold_out, self._seed, self.measurement.signal.shape, *at)
+        return Problem(self._op, self.measurement.window(*at), voxels_of(self.stack), aside=aside)
 
     @cached_property
     def brightest(self) -> Window:
         """The window in which there is most to see, by the variance of its lenslets."""
-        usable = self.measurement.usable
-        signal = self.measurement.signal
-        light = (signal if usable is None else np.where(usable, signal, 0)).sum(axis=2)
+        sums = [np.nansum(part, axis=1, dtype=float) for part in self.measurement.in_bands()]
+        light = np.concatenate(sums).reshape(self.measurement.signal.shape[:2])
         return max(self.windows, key=lambda w: float(light[w.rows, w.columns].var()))
 
     def of(self, stack: Stack) -> Problem:
@@ -159,77 +167,108 @@ class Tiles:
         Raises as volume_of.
         """
         if len(self.windows) == 1:
-            return volume_of(self.problem(self.windows[0]), self.method, self.like)
+            only = self.windows[0]
+            found = volume_of(self.problem(only), self.method, self._like(only))
+            del self._op
+            return found
         first = volume_of(self.problem(self.brightest), self.method, self._like(self.brightest))
-        found = [
-            first if w is self.brightest else volume_of_part(self.problem(w), first, self._like(w))
-            for w in bar(self.windows, len(self.windows), "windows")
-        ]
-        return self._joined(found)
+        again, joined = as_before(first), _Joined(self, bars=first.sigma is not None)
+        for number, window in enumerate(bar(self.windows, len(self.windows), "windows")):
+            own = window is self.brightest
+            part = first if own else again(self.problem(window), self._like(window))
+            joined.add(number, part)
+        del self._op  # its memory is that of all pixels that were put aside
+        return joined.volume()
 
     def _like(self, window: Window) -> np.ndarray | None:
         """What the volume of a window is to be like."""
-        return None if self.like is None else self.like[(slice(None), *self._voxels(window))]
+        return None if self.like is None else self.like[(slice(None), *self.voxels(window))]
 
-    def _voxels(self, window: Window) -> tuple[slice, slice]:
+    def voxels(self, window: Window) -> tuple[slice, slice]:
         """Rows and columns of a window's voxels."""
         s, t = self.stack.point_shape
         rows, columns = window.rows, window.columns
         return slice(rows.start * s, rows.stop * s), slice(columns.start * t, columns.stop * t)
 
-    def _joined(self, parts: Sequence[Volume]) -> Volume:
-        rows, columns = self.measurement.signal.shape[:2]
-        s, t = self.stack.point_shape
-        weights = np.zeros((rows * s, columns * t))
-        shape = (len(self.stack.depth), *weights.shape)
-        value = np.zeros(shape, parts[0].value.dtype)
-        sigma = None if parts[0].sigma is None else np.zeros_like(value)
-        owner, most = np.zeros((rows, columns), int), np.zeros((rows, columns))
-        for number, (window, part) in enumerate(zip(self.windows, parts)):
-            voxels = self._voxels(window)
-            weight = np.kron(window.weight, np.ones((s, t))).astype(value.dtype)
-            weights[voxels] += weight
-            value[(slice(None), *voxels)] += weight * part.value
-            if sigma is not None and part.sigma is not None:
-                sigma[(slice(None), *voxels)] += weight * part.sigma
-            at = window.rows, window.columns
-            better = window.weight > most[at]
-            owner[at] = np.where(better, number, owner[at])
-            most[at] = np.maximum(most[at], window.weight)
-        value /= weights
-        if sigma is not None:
-            sigma /= weights
+
+class _Joined:
+    """The volume of all windows, to which each adds its own as it comes.
+
+    tiles: the windows.
+    bars: whether their volumes have a sigma.
+    """
+
+    def __init__(self, tiles: Tiles, *, bars: bool) -> None:
+        self._tiles = tiles
+        rows, columns = tiles.measurement.signal.shape[:2]
+        s, t = tiles.stack.point_shape
+        shape = len(tiles.stack.depth), rows * s, columns * t
+        self._value = tiles.room(shape)
+        self._sigma = tiles.room(shape) if bars else None
+        weights, self._owner = np.zeros((rows, columns)), np.zeros((rows, columns), np.int32)
+        most = np.zeros((rows, columns))
+        for number, window in enumerate(tiles.windows):
+            at, weight = (window.rows, window.columns), window.weight
+            weights[at] += weight
+            self._owner[at] = np.where(weight > most[at], number, self._owner[at])
+            most[at] = np.maximum(most[at], weight)
+        self._weights = weights
+        self._told: list[Volume] = []
+        self._aside: list[tuple[np.ndarray, ...]] = []
+
+    def add(self, number: int, part: Volume) -> None:
+        """Take in the volume of the window of a number, one after the other."""
+        window = self._tiles.windows[number]
+        at = slice(None), *self._tiles.voxels(window)
+        share = window.weight / self._weights[window.rows, window.columns]
+        weight = np.kron(share, np.ones(self._tiles.stack.point_shape)).astype(part.value.dtype)
+        self._value[at] += weight * part.value
+        if self._sigma is not None and part.sigma is not None:
+            self._sigma[at] += weight * part.sigma
+        if part.held_out is not None:
+            self._aside.append(self._own(number, part.held_out))
+        nothing = np.empty((0, 0, 0))
+        self._told.append(replace(part, value=nothing, sigma=None, held_out=None))
+
+    def _own(self, number: int, held: HeldOut) -> tuple[np.ndarray, ...]:
+        """Of the pixels that were put aside in a window, as far as it is the one in which they are
+        innermost: their numbers before all lenslets, measured and predicted.
+        """
+        window, shape = self._tiles.windows[number], self._tiles.measurement.signal.shape
+        row, column, pixel = held.index.T
+        places = row + window.rows.start, column + window.columns.start, pixel
+        own = self._owner[places[:2]] == number
+        flat = np.ravel_multi_index(tuple(place[own] for place in places), shape)
+        values = (values[own].astype(np.float32) for values in (held.measured, held.predicted))
+        return flat.astype(np.min_scalar_type(math.prod(shape))), *values
+
+    def volume(self) -> Volume:
+        """That of all windows."""
+        parts = self._told
         return replace(
             parts[0],
-            value=value,
-            sigma=sigma,
+            value=self._value,
+            sigma=self._sigma,
             trace=tuple(
                 Trial(f"window {number}, {part.trace[-1].what}", part.trace[-1].misfit)
                 for number, part in enumerate(parts, 1)
             ),
             background=float(np.mean([part.background for part in parts])),
             prior=_mean_of([part.prior for part in parts if part.prior is not None]),
-            held_out=self._held(parts, owner),
+            held_out=self._held() if len(self._aside) == len(parts) else None,
             likeness=_mean_of([part.likeness for part in parts if part.likeness is not None]),
         )
 
-    def _held(self, parts: Sequence[Volume], owner: np.ndarray) -> HeldOut | None:
-        """Every pixel that was put aside, as the window predicts it in which it is innermost."""
-        index, measured, predicted = [], [], []
-        for number, (window, part) in enumerate(zip(self.windows, parts)):
-            if part.held_out is None:
-                return None
-            places = part.held_out.index + [window.rows.start, window.columns.start, 0]
-            own = owner[places[:, 0], places[:, 1]] == number
-            index.append(places[own])
-            measured.append(part.held_out.measured[own])
-            predicted.append(part.held_out.predicted[own])
-        seen, told = np.concatenate(measured), np.concatenate(predicted)
+    def _held(self) -> HeldOut:
+        """Every pixel that was put aside."""
+        flat, measured, predicted = (np.concatenate(parts) for parts in zip(*self._aside))
+        self._aside.clear()
+        places = np.unravel_index(flat, self._tiles.measurement.signal.shape)
         return HeldOut(
-            index=np.concatenate(index),
-            measured=seen,
-            predicted=told,
-            sigma=predictive_sigma(seen, told),
+            index=np.stack([place.astype(np.int32) for place in places], axis=1),
+            measured=measured,
+            predicted=predicted,
+            sigma=predictive_sigma(measured, predicted),
         )
 
 
@@ -287,9 +326,10 @@ def _weights(start: int, size: int, count: int, halo: int) -> np.ndarray:
 def _needed(method: str, pixels: int, unknowns: int, torus: tuple[int, int]) -> int:
     """Bytes that a method takes on a torus, in single precision."""
     frequencies = torus[0] * (torus[1] // 2 + 1)
-    whole = BlockCirculant.needed(pixels, unknowns, torus)
+    spectrum, making = BlockCirculant.needed(pixels, unknowns, torus)
     arrays = 48 * torus[0] * torus[1] * (pixels + unknowns)
     gain = 8 * frequencies * pixels * unknowns + 128 * unknowns * (unknowns + pixels)
     most = {"rl": arrays, "lmmse": arrays + gain, "tikhonov": arrays + gain}
     most["tv"] = total_variation.memory(torus, pixels, unknowns)
-    return whole + (max(most.values()) if method == "auto" else most[method])
+    work = max(most.values()) if method == "auto" else most[method]
+    return spectrum + max(making, work)

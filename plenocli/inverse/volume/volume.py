@@ -66,13 +66,17 @@ def predictive_sigma(measured: np.ndarray, predicted: np.ndarray) -> np.ndarray:
 
     measured, predicted: (n,).
     """
-    sigma = np.empty(len(measured))
-    square = (measured - predicted).astype(float) ** 2
-    level = np.maximum(predicted - np.quantile(predicted, 0.01), 0).astype(float)
-    law = np.stack([np.ones_like(level), level, level**2], axis=1)
-    halves = np.arange(len(measured)) % 2 == 0
-    for half in (halves, ~halves):
-        sigma[half] = np.sqrt(law[half] @ variance_law(law[~half], square[~half]))
+    darkest = float(np.quantile(predicted, 0.01))
+    sigma = np.empty(len(measured), np.result_type(measured, predicted))
+
+    def law(some: slice) -> np.ndarray:
+        level = np.maximum(predicted[some].astype(float) - darkest, 0)
+        return np.stack([np.ones_like(level), level, level**2], axis=1)
+
+    halves = slice(0, None, 2), slice(1, None, 2)
+    for half, other in (halves, halves[::-1]):
+        square = (measured[other].astype(float) - predicted[other]) ** 2
+        sigma[half] = np.sqrt(law(half) @ variance_law(law(other), square))
     return sigma
 
 

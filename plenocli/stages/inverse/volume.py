@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -25,6 +26,8 @@ CLEARER_DB = 3.0
 from which on that is told.
 """
 SUFFIXES = (".h5", ".tif", ".tiff")
+COPIES = 3
+"""How often a volume is in memory while its OME-TIFF is written (measured)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,10 +114,11 @@ def run_volume(
     from plenocli.base.device import device as device_of
     from plenocli.files.artefacts.provenance import Provenance, describe_inputs
     from plenocli.files.atomic import check_output
-    from plenocli.files.images.mosaic import read_capture
+    from plenocli.files.images.mosaic import capture_in_file
     from plenocli.files.read.calibrations import read_calibration
     from plenocli.files.results.stacks import read_stack
     from plenocli.files.results.volumes import read_volume, same_voxels
+    from plenocli.files.scratch import Scratch
     from plenocli.inverse.volume.superpixels import measured
     from plenocli.inverse.volume.tiles import Tiles
 
@@ -123,18 +127,19 @@ def run_volume(
     check_output(output, overwrite=overwrite, inputs=list(inputs.values()), suffixes=SUFFIXES)
     if like is not None and method not in ("auto", "tv"):
         raise UsageError("volumes are tied by total variation alone", "--method", "leave it out")
-    other = None if like is None else read_volume(like)
+    other = None if like is None else read_volume(like, in_file=True)
     there = device_of(device)
     stack = read_stack(pif)
     known = None if calibration is None else read_calibration(calibration, response=False)
-    shot = read_capture(capture, cfa=None if known is None else known.sensor.cfa)
+    room = Scratch(output)
     measurement = measured(
-        shot,
+        capture_in_file(capture, cfa=None if known is None else known.sensor.cfa),
         stack,
         known,
         where=calibration,
         background=0.0 if background == "auto" else background,
         channel=channel,
+        room=room,
     )
     (rows, columns), several = measurement.signal.shape[:2], stack.lenslets
     note(
@@ -142,7 +147,7 @@ def run_volume(
         f"{stack.point_shape[0] // several} x {stack.point_shape[1]} voxels a lenslet"
     )
     trials: tuple[Trial, ...] = ()
-    how: dict[str, Any] = dict(hold_out=hold_out, seed=seed, where=pif, device=there)
+    how: dict[str, Any] = dict(hold_out=hold_out, seed=seed, where=pif, device=there, room=room)
     method = method if like is None else "tv"
     tiles = Tiles(stack, measurement, method, **how)
     if most_planes is not None:
@@ -150,9 +155,7 @@ def run_volume(
         tiles = Tiles(stack, measurement, method, **how)
     if other is not None:
         tiles.like = same_voxels(other, stack, (rows, columns), str(like))
-    if len(tiles.windows) > 1:
-        size = by(tiles.windows[0].weight.shape)
-        note(f"in {len(tiles.windows)} windows of {size} lenslets: --mem-limit allows no more")
+    _plan(output, tiles)
     if background == "auto":
         _take_haze(tiles)
     volume = tiles.volume()
@@ -211,6 +214,29 @@ def _supported(tiles: Tiles, most: int) -> tuple[Stack, tuple[Trial, ...]]:
     places = ", ".join(format_length(depth) for depth in stack.depth.tolist())
     note(f"the capture supports {len(chosen)} of the planes: {places}")
     return stack, trials
+
+
+def _plan(output: Path, tiles: Tiles) -> None:
+    """Say in how many windows it is done.
+
+    Raises NumericsError where an OME-TIFF of the volume has no room in memory.
+    """
+    from plenocli.base.budget import budget
+
+    if len(tiles.windows) > 1:
+        size = by(tiles.windows[0].weight.shape)
+        note(f"in {len(tiles.windows)} windows of {size} lenslets: --mem-limit allows no more")
+    if output.suffix == ".h5":
+        return
+    rows, columns, _ = tiles.measurement.signal.shape
+    stack, channels = tiles.stack, 1 if tiles.method in ("rl", "tv") else 2
+    voxels = len(stack.depth) * rows * columns * math.prod(stack.point_shape)
+    budget().require(
+        4 * COPIES * channels * voxels,
+        "an OME-TIFF of this volume",
+        output,
+        "take an .h5, whose planes stay in a file, or fewer planes",
+    )
 
 
 def _take_haze(tiles: Tiles) -> None:

@@ -57,10 +57,9 @@ def test_haze_is_the_light_of_lenslets_without_a_specimen():
 
 def test_pixels_that_count_behind_no_lenslet_hide_no_haze():
     signal = np.tile(np.arange(1.0, 5.0), (6, 6, 1))
-    usable = np.ones(signal.shape, bool)
-    usable[..., 0] = usable[2, 3] = False
-    found = haze(Measurement(signal=signal, read_variance=0.0, usable=usable))
-    assert found == pytest.approx(0.95 * np.arange(1.0, 5.0))
+    signal[..., 0] = signal[2, 3] = np.nan
+    found = haze(Measurement(signal=signal, read_variance=0.0))
+    assert found == pytest.approx(0.95 * np.array([0.0, 2.0, 3.0, 4.0]))
 
 
 def test_too_few_lenslets_have_no_haze():

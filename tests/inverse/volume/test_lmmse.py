@@ -24,9 +24,8 @@ def small(whole, mask=0.0, hold_out=0.0, dtype=float, signal=None):
     op = op.on_torus() if whole else op
     rng = np.random.default_rng(5)
     signal = rng.standard_normal(op.range.shape) if signal is None else signal
-    measurement = Measurement(
-        signal=signal, read_variance=1.0, usable=rng.random(op.range.shape) >= mask
-    )
+    usable = rng.random(op.range.shape) >= mask
+    measurement = Measurement(signal=np.where(usable, signal, np.nan), read_variance=1.0)
     return Problem(op, measurement, VOXELS, hold_out=hold_out)
 
 
@@ -208,10 +207,9 @@ def test_a_pixel_without_light_is_as_good_as_none(gain):
         chosen = kept if not dark else np.ones(25, bool)
         some = [((blocks * kept[:, None])[:, chosen], o) for blocks, o in parts]
         measurement = Measurement(
-            signal=signal[..., chosen],
+            signal=np.where(usable[..., None], signal[..., chosen], np.nan),
             read_variance=0.03**2,
             gain=gain,
-            usable=np.repeat(usable[..., None], chosen.sum(), axis=2),
         )
         op = BlockCirculant(some, (6, 7), (8, 9))
         found.append(lmmse(Problem(op, measurement, voxels, hold_out=0.0)))

@@ -5,16 +5,16 @@ import pytest
 
 from plenocli.base.errors import NumericsError
 from plenocli.base.linear_maps import BlockCirculant
-from plenocli.inverse.volume.measurement import Measurement, Problem, Voxels
+from plenocli.inverse.volume.measurement import Measurement, Problem, Voxels, put_aside
 from plenocli.inverse.volume.volume import HeldOut, predictive_sigma, variance_law
 from tests.reference import volumes
 
 VOXELS = Voxels((2, 3), 1e-6, (-1e-6, 1e-6))
 
 
-def small(**options):
+def small(usable=True, **options):
     op = BlockCirculant(volumes.kernels(2, 6, 8), (5, 6), (7, 8))
-    signal = np.random.default_rng(1).random(op.range.shape)
+    signal = np.where(usable, np.random.default_rng(1).random(op.range.shape), np.nan)
     return Problem(op, Measurement(signal=signal, read_variance=1e-4, **options), VOXELS)
 
 
@@ -32,6 +32,15 @@ def test_a_share_of_the_pixels_is_put_aside_and_always_the_same():
     assert 0.02 < problem.held.mean() < 0.09
     np.testing.assert_array_equal(problem.held, again.held)
     assert not np.any(problem.held & problem.counts) and np.all(problem.held | problem.counts)
+
+
+def test_a_window_puts_aside_the_pixels_that_the_whole_does():
+    """The numbers of the whole draw, cut; the stream's first ones are those of NumPy."""
+    rng = np.random.default_rng(np.random.SeedSequence([5, 0, *b"volume-hold-out"]))
+    whole = rng.random((9, 11, 6)) < 0.2
+    for rows, columns in ((slice(0, 9), slice(0, 11)), (slice(3, 8), slice(2, 7))):
+        found = put_aside(0.2, 5, whole.shape, rows, columns)
+        np.testing.assert_array_equal(found, whole[rows, columns])
 
 
 def test_what_is_not_usable_is_neither_fitted_nor_put_aside():

@@ -20,11 +20,10 @@ def seen(hold_out=0.05, noise=0.01, background=0.0, gain=0.0, mask=0.0, seed=0):
     light = op.forward(x)
     signal = light + background + noise * rng.standard_normal(light.shape)
     measurement = Measurement(
-        signal=signal,
+        signal=np.where(rng.random(light.shape) >= mask, signal, np.nan),
         read_variance=noise**2,
         gain=gain,
         background=background,
-        usable=rng.random(light.shape) >= mask,
     )
     return Problem(op, measurement, VOXELS, hold_out=hold_out, seed=seed), x
 

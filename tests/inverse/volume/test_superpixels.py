@@ -46,7 +46,7 @@ def test_lenslets_come_into_the_cells_of_the_kernels(aside):
     found = measured(shot, stack, known)
     assert found.signal.shape == (3 + aside, 7, 26 * 14)
     halves = found.signal.reshape(3 + aside, 7, 2, 13, 14)
-    usable = found.usable.reshape(halves.shape)
+    usable = np.isfinite(halves)
     expected = np.pad(values, [(aside, aside), (0, 0)]).reshape(3 + aside, 2, 7)
     for lower in (0, 1):
         seen = halves[:, :, lower, 5:8, 6:8].mean(axis=(2, 3))
@@ -54,7 +54,7 @@ def test_lenslets_come_into_the_cells_of_the_kernels(aside):
         assert np.array_equal(usable[:, :, lower, 6, 7], there)
         assert np.corrcoef(seen[there], expected[:, lower][there])[0, 1] > 0.999
     # the discs stand in the middle of their superpixels
-    disc = halves[1, 3, 0]
+    disc = np.nan_to_num(halves[1, 3, 0])
     assert abs(disc - disc[::-1]).max() < 0.02 * disc.max()
 
 
@@ -86,16 +86,16 @@ def in_colour():
 def test_a_colours_pixels_alone_tell_its_light_in_units_of_white(in_colour, letter):
     shot, stack, known, values = in_colour
     found = measured(shot, stack, known, channel=letter)
-    share = found.usable.mean() / measured(replace(shot, cfa="mono"), stack, known).usable.mean()
+    whole = measured(replace(shot, cfa="mono"), stack, known)
+    share = np.isfinite(found.signal).mean() / np.isfinite(whole.signal).mean()
     assert share == pytest.approx(0.5 if letter == "G" else 0.25, abs=0.03)
     middle = np.zeros((13, 14), bool)
     middle[4:9, 5:9] = True
-    seen = np.where(found.usable & middle.ravel(), found.signal, np.nan)
+    seen = np.where(middle.ravel(), found.signal, np.nan)
     assert np.allclose(np.nanmean(seen, axis=2) / values[letter], 0.5, rtol=0.06)
     white = Capture(mosaic=known.white.flat * 200.0 * COLOURS["G"], cfa="RGGB")
     level = [
-        np.nanmean(m.signal[m.usable])
-        for m in (measured(white, stack, known, channel=c) for c in COLOURS)
+        np.nanmean(m.signal) for m in (measured(white, stack, known, channel=c) for c in COLOURS)
     ]
     assert np.ptp(level) < 0.02 * level[0]
 
@@ -133,7 +133,7 @@ def test_kernels_of_a_whole_part_of_the_pixels_see_the_means_of_as_many():
 
     fine, found = measured(shot, stack(28, 42), even), measured(shot, stack(14, 14), even)
     blocks = fine.signal.reshape(*COUNT, 14, 2, 14, 3).mean(axis=(3, 5))
-    assert found.usable.all()
+    assert np.isfinite(found.signal).all()
     assert np.allclose(found.signal.reshape(blocks.shape), blocks, atol=1e-9)
     assert found.gain == pytest.approx(fine.gain / 6)
     assert found.read_variance == pytest.approx(fine.read_variance / 6)
@@ -168,9 +168,9 @@ def test_dust_of_the_white_image_is_taken_off_or_left_out():
         )
         for d in (dust, 1.0)
     )
-    usable = found.usable.reshape(*COUNT, 13, 13)
+    usable = np.isfinite(found.signal).reshape(*COUNT, 13, 13)
     assert not usable[1, 1, 4:9, 4:9].any() and usable[1, 1, 0].all()
-    assert usable[3, 4, 4:9, 4:9].all() and clean.usable.all()
+    assert usable[3, 4, 4:9, 4:9].all() and np.isfinite(clean.signal).all()
     rim = np.ones((13, 13), bool)
     rim[2:11, 2:11] = False  # about the spots values between pixels are mixed
     inner = np.zeros((13, 13), bool)
@@ -193,5 +193,5 @@ def test_pixels_whose_white_is_below_the_dark_level_are_no_dust():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         found = measured(Capture(mosaic=200 * light), stack, known)
-    usable = found.usable.reshape(*COUNT, 13, 13)
+    usable = np.isfinite(found.signal).reshape(*COUNT, 13, 13)
     assert usable[..., 6, 6].all() and not usable[..., 0, 0].any()

@@ -1,5 +1,6 @@
-"""Windows of lenslets give what all lenslets at once give, and are as few as memory wants."""
+"""Windows of lenslets give what all lenslets at once give, and are what the memory has room for."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -7,9 +8,11 @@ import pytest
 
 from plenocli.base.budget import Budget, within
 from plenocli.base.errors import NumericsError
+from plenocli.files.scratch import Scratch
 from plenocli.forward.propagation.accuracy_record import AccuracyRecord
 from plenocli.forward.volume.stack import Stack
 from plenocli.inverse.volume import tiles
+from plenocli.inverse.volume.choose import as_before, volume_of
 from plenocli.inverse.volume.measurement import Measurement
 from plenocli.inverse.volume.tiles import Tiles
 from tests.reference import volumes
@@ -58,12 +61,15 @@ def tiled(stack, measurement, method, memory=1 << 40, like=None):
 def memory_of(method, several, count=COUNT, halo=1):
     """Bytes with which windows as many as this fit, and no fewer."""
     size = [tiles._size(n, m, halo) for n, m in zip(count, several)]
-    return tiles._needed(method, 9, 8, tiles.torus_for(tuple(size), (1, 1)))
+    kept = tiles.HELD_BYTES * 0.1 * np.prod(count) * 9
+    return math.ceil(tiles._needed(method, 9, 8, tiles.torus_for(tuple(size), (1, 1))) + kept)
 
 
 @pytest.fixture(autouse=True)
-def small_chunks(monkeypatch):
+def small(monkeypatch):
+    """Chunks, and no windows smaller than need be."""
     monkeypatch.setattr("plenocli.base.linear_maps.CHUNK", 1 << 10)
+    monkeypatch.setattr(tiles, "SPARE", 0.0)
 
 
 @pytest.mark.parametrize("method", ["rl", "lmmse", "tv"])
@@ -134,6 +140,71 @@ def test_windows_cover_the_array_and_overlap_by_two_halos(count, several, halo):
                 assert weight[: halo - fade].max() < 1e-3
             assert 0 <= part.start < part.stop <= n
     assert len(sizes) == 1 and weights.min() > 0.1
+
+
+@pytest.mark.parametrize("method", ["lmmse", "tv"])
+def test_the_volume_of_all_windows_is_the_weighted_mean_of_theirs(
+    stack, measurement, method, tmp_path
+):
+    """Voxel by voxel, from the volumes of the windows; in memory, and in a file."""
+    memory = memory_of(method, MANY)
+    with within(Budget(memory)):
+        parts = Tiles(stack, measurement, method, hold_out=0.1, seed=1)
+        first = volume_of(parts.problem(parts.brightest), method)
+        again = as_before(first)
+        sums, weights, held = np.zeros((3, 2, 42, 52)), np.zeros((42, 52)), {}
+        for window in parts.windows:
+            part = again(parts.problem(window), None)
+            for row in range(42):
+                for column in range(52):
+                    i, j = row // 2 - window.rows.start, column // 2 - window.columns.start
+                    if 0 <= i < len(window.row_weight) and 0 <= j < len(window.column_weight):
+                        weight = window.row_weight[i] * window.column_weight[j]
+                        at = slice(None), row - 2 * window.rows.start
+                        at = *at, column - 2 * window.columns.start
+                        weights[row, column] += weight
+                        sums[0, :, row, column] += weight * part.value[at]
+                        if part.sigma is not None:
+                            sums[1, :, row, column] += weight * part.sigma[at]
+            for (i, j, pixel), predicted in zip(part.held_out.index, part.held_out.predicted):
+                place = i + window.rows.start, j + window.columns.start, pixel
+                weight = window.row_weight[i] * window.column_weight[j]
+                if weight > held.get(place, (0,))[0]:
+                    held[place] = weight, predicted
+        found = parts.volume()
+        filed = Tiles(
+            stack, measurement, method, hold_out=0.1, seed=1, room=Scratch(tmp_path / "v.h5")
+        ).volume()
+    assert len(parts.windows) > 1
+    assert np.allclose(found.value, sums[0] / weights, atol=1e-5 * found.value.max())
+    assert (found.sigma is None) == (method == "tv")
+    if found.sigma is not None:
+        assert np.allclose(found.sigma, sums[1] / weights, rtol=1e-5)
+        np.testing.assert_allclose(filed.sigma.whole(), found.sigma, rtol=1e-5)
+    np.testing.assert_allclose(filed.value.whole(), found.value, atol=1e-5 * found.value.max())
+    told = {tuple(i): p for i, p in zip(found.held_out.index, found.held_out.predicted)}
+    assert told.keys() == held.keys()
+    assert all(told[i] == pytest.approx(held[i][1], abs=1e-5) for i in told)
+
+
+def test_windows_fit_and_are_the_least_work(stack, measurement):
+    """Against all splits, one by one."""
+    count = 60, 75
+    whole = replace(measurement, signal=np.ones((*count, 9)))
+    for share in (0.9, 0.4, 0.2):
+        memory = int(share * memory_of("rl", (1, 1), count))
+        with within(Budget(memory)):
+            found = Tiles(stack, whole, "rl", hold_out=0.1, seed=1).windows
+        work = {}
+        for rows in range(1, 61):
+            for columns in range(1, 76):
+                if memory_of("rl", (rows, columns), count) <= memory:
+                    size = [tiles._size(n, m, 1) for n, m in zip(count, (rows, columns))]
+                    area = math.prod(tiles.torus_for(tuple(size), (1, 1)))
+                    work[rows, columns] = rows * columns * area
+        area = math.prod(tiles.torus_for(found[0].weight.shape, (1, 1)))
+        assert len(found) * area == min(work.values())
+        assert tiles._needed("rl", 9, 8, tiles.torus_for(found[0].weight.shape, (1, 1))) <= memory
 
 
 def test_what_does_not_fit_even_so_is_refused(stack, measurement):

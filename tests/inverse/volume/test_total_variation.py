@@ -37,9 +37,8 @@ def box(count=COUNT, torus=TORUS, noise=0.03, hold_out=0.0, dtype=float, pixels=
     truth[0, 2:5, 3:7], truth[1, 1:4, 1:3] = 1, 0.7
     light = op.forward(VOXELS.lenslets(truth))
     signal = light + noise * rng.standard_normal(light.shape)
-    measurement = Measurement(
-        signal=signal, read_variance=noise**2, usable=rng.random(light.shape) > 0.1
-    )
+    usable = rng.random(light.shape) > 0.1
+    measurement = Measurement(signal=np.where(usable, signal, np.nan), read_variance=noise**2)
     return Problem(op, measurement, VOXELS, hold_out=hold_out), truth
 
 

@@ -67,17 +67,24 @@ def read_calibration(
     return calibration_of(_read(path, needs, white_image), response=response)
 
 
-def read_images(path: str | Path) -> Calibration:
+def read_images(path: str | Path, *, small: bool = False, superpixels: bool = False) -> Calibration:
     """A Calibration with its lenslets, and the white and the dark image, which stay in the file;
-    without responses and superpixels.
+    without responses.
+
+    small: whether what is small beside the memory is held.
+    superpixels: whether those of white are wanted; they stay there as well.
 
     Raises InputError where the file cannot be read.
     """
-    unread = [f"response/{name}" for name in ("F", "covariance", "white", "polarised", "energy")]
-    with opened_artefact(path, "calibration", [*IMAGES, *unread]) as (artefact, stored):
-        for name in stored.keys() & IMAGES:
-            image: Any = Plane(stored[name].shape, stored[name].window)
-            artefact.data[name] = image
+    unread = [f"response/{name}" for name in ("F", "covariance", "polarised", "energy")]
+    wanted = IMAGES | ({"response/white"} if superpixels else set())
+    unread += [] if superpixels else ["response/white"]
+    apart, large = (unread, wanted) if small else ([*wanted, *unread], set())
+    with opened_artefact(path, "calibration", apart, large=large) as (artefact, stored):
+        for name in stored.keys() & wanted:
+            values = stored[name]
+            kept: Any = Plane(values.shape, values.window)
+            artefact.data[name] = kept if name in IMAGES else _in_file(values, told_apart=False)
     return calibration_of(artefact, response=False)
 
 
@@ -125,7 +132,9 @@ class ByLenslet:
     def __init__(self, stored: Stored) -> None:
         self.stored, self.shape, self.ndim = stored, stored.shape, len(stored.shape)
 
-    def __getitem__(self, places: tuple[np.ndarray, ...]) -> np.ndarray:
+    def __getitem__(self, places: slice | tuple[np.ndarray, ...]) -> np.ndarray:
+        if isinstance(places, slice):  # of rows
+            return _of_scale(self.stored, self.stored.part(places))
         rows, columns = places
         out = np.empty((len(rows), *self.shape[2:]), self.stored.dtype)
         dense = 2 * len(rows) > math.prod(np.ptp(place) + 1 for place in places) if len(rows) else 0

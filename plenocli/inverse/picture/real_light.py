@@ -9,14 +9,17 @@ docs/model.md, "Real light".
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from plenocli.base.errors import InputError
 from plenocli.base.progress import note
 from plenocli.base.text import by
+from plenocli.base.tiling import EVERYTHING, Plane, bands
 from plenocli.forward.sensor.noise import Noise
 from plenocli.forward.sensor.superpixel import extract
 from plenocli.inverse.calibration.calibration import there
@@ -38,6 +41,8 @@ FEWEST = 16
 """Lenslets whose white image tells what a pixel has in common with others."""
 UNLIKE = 6.0
 """Standard deviations from which on a pixel of white is not that of all lenslets: dust."""
+MEDIANS = 1 << 21
+"""Values whose medians are looked for at a time."""
 DUST = 0.5
 """Of the white that all lenslets have, below which a pixel counts for nothing."""
 BRIGHT = 0.8
@@ -98,13 +103,15 @@ def along_the_grid(
     )
 
 
-def above_dark(capture: Capture, calibration: Calibration) -> np.ndarray:
+def above_dark(capture: Capture, calibration: Calibration, rows: slice = EVERYTHING) -> np.ndarray:
     """Signal (row, column) above the dark level of a calibration, at its exposure.
+
+    rows: of the sensor; of a capture or a dark image in a file no more are read.
 
     Raises InputError where the two sensors differ.
     """
     dark = there(calibration.dark).mean
-    if dark.ndim == 2 and dark.shape != capture.shape:
+    if len(dark.shape) == 2 and dark.shape != capture.shape:
         raise InputError(
             f"is {by(capture.shape)} px, the calibration {by(dark.shape)}",
             capture.metadata.path,
@@ -112,7 +119,8 @@ def above_dark(capture: Capture, calibration: Calibration) -> np.ndarray:
         )
     reference = calibration.sensor.exposure
     scale = reference / capture.exposure_s if reference and capture.exposure_s else 1.0
-    return (capture.mosaic - dark) * scale
+    own = Plane.of(dark).read(rows, EVERYTHING) if len(dark.shape) == 2 else dark
+    return (Plane.of(capture.mosaic).read(rows, EVERYTHING) - own) * scale
 
 
 def motion(
@@ -194,39 +202,70 @@ def typical_white(white: np.ndarray, lit: np.ndarray) -> tuple[np.ndarray, np.nd
     Returns it, and which pixels lie under dust.
     """
     own = np.where(np.isfinite(white), white, 0.0)
-    found = in_common(white, lit)
+    found = in_common(np.moveaxis(white, 2, 0), lit)
     if found is None:
         return own, np.zeros(white.shape, bool)
-    typical, spread = found
+    typical = found.typical()
     with np.errstate(invalid="ignore"):
-        kept = np.abs(own - typical) <= UNLIKE * spread * typical
+        kept = np.abs(own - typical) <= UNLIKE * found.spread * typical
         return np.where(kept, typical, own), own < DUST * typical
 
 
-def in_common(white: np.ndarray, lit: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+@dataclass(frozen=True, kw_only=True)
+class Common:
+    """A white image without dust.
+
+    pixel: (pixel,) what lenslets have in common, NaN where too few tell.
+    level: (lenslet_row, lenslet_column, 1) brightness of each, NaN where it does not tell.
+    spread: (pixel,) standard deviation of each pixel's share of it.
+    """
+
+    pixel: np.ndarray
+    level: np.ndarray
+    spread: np.ndarray
+
+    def typical(self, rows: slice = EVERYTHING) -> np.ndarray:
+        """(lenslet_row, lenslet_column, pixel) what it would be behind some rows of lenslets."""
+        return self.level[rows] * self.pixel
+
+
+def in_common(white: Any, lit: np.ndarray) -> Common | None:
     """The white image without dust: what lenslets have in common times the brightness of each, both
     medians, of which dust on few lenslets and on less than half of one moves neither.
 
-    white, lit: as for typical_white.
+    white: (pixel, lenslet_row, lenslet_column), NaN where it is not known; may stay in a file, of
+        which slices are looked at.
+    lit: (lenslet_row, lenslet_column), which of them count.
 
-    Returns it, NaN where no lenslet or too few tell, and the spread of each pixel's share of it
-    (pixel,); None where too few lenslets are lit.
+    Returns None where too few lenslets are lit.
     """
-    seen = np.isfinite(white) & lit[..., None]
-    counts = seen.sum(axis=(0, 1)) >= FEWEST
-    known = np.where(seen, white, np.nan)
-    common, spread = np.full((2, white.shape[2]), np.nan)
-    if counts.any():
-        common[counts] = np.nanmedian(known[..., counts], axis=(0, 1))
-    counts &= common > 0
+    pixels = white.shape[0]
+    groups = bands(pixels, MEDIANS // lit.size)
+    common, spread = np.full((2, pixels), np.nan)
+
+    def known(some: slice) -> np.ndarray:
+        return np.where(lit, white[some, :], np.nan).reshape(-1, lit.size)
+
+    for some in groups:
+        values = known(some)
+        told = np.isfinite(values).sum(axis=1) >= FEWEST
+        if told.any():
+            common[some][told] = np.nanmedian(values[told], axis=1)
+    counts = common > 0
     if not counts.any():
         return None
-    share = known[..., counts] / common[counts]
+    common[~counts] = np.nan
     level = np.full((*lit.shape, 1), np.nan)
-    some = np.isfinite(share).any(axis=2)
-    level[some, 0] = np.nanmedian(share[some], axis=1)
-    spread[counts] = NORMAL * np.nanmedian(np.abs(share / level - 1), axis=(0, 1))
-    return level * np.where(counts, common, np.nan), spread
+    for rows in bands(lit.shape[0], MEDIANS // (pixels * lit.shape[1])):
+        seen = np.where(lit[rows], white[:, rows], np.nan)[counts] / common[counts, None, None]
+        tells = np.isfinite(seen).any(axis=0)
+        level[rows][tells, 0] = np.nanmedian(seen[:, tells], axis=0)
+    for some in groups:
+        own = counts[some]
+        if own.any():
+            share = known(some)[own] / common[some][own, None] / level.ravel() - 1
+            spread[some][own] = NORMAL * np.nanmedian(np.abs(share), axis=1)
+    return Common(pixel=common, level=level, spread=spread)
 
 
 def _bins(
@@ -283,16 +322,38 @@ def pixel_noise(
     cut, white: (lenslet_row, lenslet_column, pixel) of the capture and of the white image.
     usable: like cut.
     """
+    return told_noise(capture, calibration) or noise_of_parts(
+        capture, calibration, [(cut, white, usable)]
+    )
+
+
+def told_noise(capture: Capture, calibration: Calibration) -> Noise | None:
+    """Of a pixel, as the capture tells or the calibration does; None where neither does."""
     if capture.noise is not None and capture.noise.without_signal > 0:
         return capture.noise
     sensor = calibration.sensor
     if sensor.gain is not None:
         return Noise(gain=sensor.gain, read_variance=sensor.read_variance)
-    apart = 1 if capture.cfa == "mono" else 2
-    found = transfer_noise(cut, white, usable, there(calibration.windows).shape, apart)
+    return None
+
+
+def noise_of_parts(
+    capture: Capture,
+    calibration: Calibration,
+    parts: Iterable[tuple[np.ndarray, np.ndarray, np.ndarray]],
+) -> Noise:
+    """Of a pixel, from the capture itself.
+
+    parts: cut, white and usable, as of pixel_noise, of some rows of lenslets after the other.
+    """
+    shape, apart = there(calibration.windows).shape, 1 if capture.cfa == "mono" else 2
+    shares, peak = [], 0.0
+    for cut, white, usable in parts:
+        shares.append(_unlike_neighbours(cut, white, usable, shape, apart))
+        peak = max(peak, float(np.nanmax(np.abs(white))))
     # a sensor without noise is none
-    least = max(sensor.read_variance, (1e-6 * float(np.nanmax(np.abs(white)))) ** 2)
-    return Noise(gain=found, read_variance=least)
+    least = max(calibration.sensor.read_variance, (1e-6 * peak) ** 2)
+    return Noise(gain=_photon_transfer(np.concatenate(shares)), read_variance=least)
 
 
 def transfer_noise(
@@ -312,6 +373,19 @@ def transfer_noise(
 
     Returns the variance for one unit of signal.
     """
+    return _photon_transfer(_unlike_neighbours(cut, white, usable, shape, apart))
+
+
+def _unlike_neighbours(
+    cut: np.ndarray,
+    white: np.ndarray,
+    usable: np.ndarray,
+    shape: tuple[int, int],
+    apart: int,
+) -> np.ndarray:
+    """(n,) mixed second differences over the root of the level, one of each bright pixel whose
+    neighbours are so; arguments as of transfer_noise.
+    """
     peak = np.nanmax(np.where(usable, white, 0.0), axis=2, keepdims=True)
     bright = np.where(usable & (white > BRIGHT * peak), cut, np.nan).reshape(-1, *shape)
     both, n = 2 * apart, apart
@@ -319,7 +393,9 @@ def transfer_noise(
     mixed = (second[:, :, both:] - 2 * second[:, :, n:-n] + second[:, :, :-both]) / 6
     level = bright[:, n:-n, n:-n]
     good = np.isfinite(mixed) & (level > 0)
-    if np.count_nonzero(good) < 100:
-        return 0.0
-    share = np.abs(mixed[good]) / np.sqrt(level[good])
-    return float((NORMAL * np.median(share)) ** 2)
+    return (np.abs(mixed[good]) / np.sqrt(level[good])).astype(np.float32)
+
+
+def _photon_transfer(shares: np.ndarray) -> float:
+    """Variance for one unit of signal, of what _unlike_neighbours gives."""
+    return 0.0 if len(shares) < 100 else float((NORMAL * np.median(shares)) ** 2)

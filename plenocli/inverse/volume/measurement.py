@@ -15,6 +15,8 @@ from plenocli.base.random_streams import skip, stream
 from plenocli.base.tiling import BAND, bands
 from plenocli.inverse.volume.volume import HeldOut, predictive_sigma
 
+AT_ONCE = 4 * BAND
+"""Pixels that are looked at together, where all are."""
 DARK = 1e-2
 """Share of the brightest pixel's light below which a pixel of the superpixel counts for nothing."""
 SEEN = 0.9
@@ -56,7 +58,7 @@ class Measurement:
     def in_bands(self) -> Iterator[np.ndarray]:
         """The signal (lenslet, pixel) of some rows of lenslets after the other."""
         rows, columns, pixels = self.signal.shape
-        for some in bands(rows, 4 * BAND // (columns * pixels)):
+        for some in bands(rows, AT_ONCE // (columns * pixels)):
             yield self.signal[some, :].reshape(-1, pixels)
 
     def variance(self, signal: np.ndarray) -> np.ndarray:

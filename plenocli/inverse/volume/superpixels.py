@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,11 +13,11 @@ import numpy as np
 
 from plenocli.base.errors import InputError, UsageError
 from plenocli.base.text import by
-from plenocli.base.tiling import BAND, EVERYTHING, bands, in_cells, in_lenslets
+from plenocli.base.tiling import EVERYTHING, Plane, bands, in_cells, in_lenslets
 from plenocli.forward.sensor.capture import SuperpixelGrid
 from plenocli.forward.sensor.cfa import cfa_map
 from plenocli.forward.sensor.frames import saturated
-from plenocli.forward.sensor.superpixel import extract
+from plenocli.forward.sensor.superpixel import extract, inside
 from plenocli.inverse.calibration.calibration import there
 from plenocli.inverse.picture.real_light import (
     DUST,
@@ -24,10 +25,11 @@ from plenocli.inverse.picture.real_light import (
     above_dark,
     binned,
     in_common,
-    pixel_noise,
+    noise_of_parts,
     sampled,
+    told_noise,
 )
-from plenocli.inverse.volume.measurement import Measurement
+from plenocli.inverse.volume.measurement import AT_ONCE, Measurement
 
 if TYPE_CHECKING:
     from plenocli.forward.sensor.capture import Capture
@@ -42,6 +44,10 @@ LEAST_DUST, MOST_DUST = 0.02, 0.02
 """Of a pixel's light, what dust takes away at the least, and what is left at the least: such pixels
 count for nothing anyhow.
 """
+MARGIN = 64
+"""Pixels beyond superpixels that are read with them: splines forget what is further away."""
+Room = Callable[[tuple[int, ...]], Any]
+"""What gives room for values of a shape, which are put and looked at by slices."""
 DIM = 0.05
 """Of the usual white level, below which a lenslet counts for nothing."""
 
@@ -54,7 +60,7 @@ def measured(
     where: str | Path | None = None,
     background: float = 0.0,
     channel: str | None = None,
-    room: Callable[[tuple[int, ...]], Any] = np.empty,
+    room: Room = np.empty,
 ) -> Measurement:
     """Superpixels of a capture, one unit of light the mean level of the white image, or what the
     capture calls one.
@@ -79,13 +85,13 @@ def measured(
     if calibration is None:
         found = _tiled(capture, shape, stack.lattice, channel)
     else:
-        found = _resampled(capture, shape, stack.lattice, calibration, where, channel)
+        found = _resampled(capture, shape, stack.lattice, calibration, where, channel, room)
         even = in_lenslets(stack.even()[None, None], several).mean(axis=(0, 1))
         white = white_superpixel(calibration, shape, stack.lattice, channel)
         found = found.times(_evening(white.ravel(), even))
     (rows, columns), pixels = found.count, shape[0] * shape[1]
     signal = room((-(-rows // several), columns, several * pixels))
-    for cells in bands(signal.shape[0], 4 * BAND // (several * columns * pixels)):
+    for cells in bands(signal.shape[0], AT_ONCE // (several * columns * pixels)):
         first, last = cells.start * several, cells.stop * several
         cut = found.cut(slice(first, min(last, rows)))
         # what the last row of cells lacks
@@ -113,6 +119,18 @@ class _Superpixels:
     def times(self, factor: np.ndarray) -> _Superpixels:
         """The same times a factor (pixel,)."""
         return replace(self, cut=lambda rows: self.cut(rows) * factor)
+
+    def below_nothing(self) -> _Superpixels:
+        """The same with one row more, the first, of which nothing is known."""
+
+        def cut(rows: slice) -> np.ndarray:
+            own = self.cut(slice(max(rows.start - 1, 0), max(rows.stop - 1, 1)))
+            above = int(rows.start == 0)
+            whole = np.pad(own, ((above, 0), (0, 0), (0, 0)), constant_values=np.nan)
+            return whole[: rows.stop - rows.start]
+
+        rows, columns = self.count
+        return replace(self, count=(rows + 1, columns), cut=cut)
 
 
 def _asked(capture: Capture, channel: str | None) -> str:
@@ -160,15 +178,14 @@ def white_superpixel(
             "holds no white image", "calibration", "calibrate with one (--white), as measured"
         )
     grid = calibration.grid
-    known = _sampled(
-        np.where(np.isfinite(white.flat), white.flat, np.nan),
-        grid.centres[grid.valid],
-        shape,
-        _step(calibration, shape, lattice),
-        _corners(calibration.sensor.cfa, channel),
-    )
-    light = np.nansum(known, axis=0).reshape(shape)
-    count = np.isfinite(known).sum(axis=0).reshape(shape)
+    step, flat = _step(calibration, shape, lattice), Plane.of(white.flat)
+    corners, pixels = _corners(calibration.sensor.cfa, channel), math.prod(shape)
+    light, count = np.zeros((2, *shape))
+    for rows in bands(len(grid.valid), AT_ONCE // (pixels * grid.valid.shape[1])):
+        own = grid.centres[rows][grid.valid[rows]]
+        known = _sampled(flat, own, shape, step, corners)
+        light += np.nansum(known, axis=0, dtype=float).reshape(shape)
+        count += np.isfinite(known).sum(axis=0).reshape(shape)
     # behind lenslets an even number of pixels apart a colour is seen by the same ones everywhere
     around = [uniform_filter(a.astype(float), 3, mode="nearest") for a in (light, count)]
     around[1] = np.maximum(around[1], 1 / 9)
@@ -183,32 +200,52 @@ def _corners(cfa: str, channel: str | None) -> list[tuple[int, int]]:
 
 
 def _sampled(
-    image: np.ndarray,
+    image: Plane,
     centres: np.ndarray,
     shape: tuple[int, int],
     step: tuple[float, float],
     corners: list[tuple[int, int]],
 ) -> np.ndarray:
     """As `sampled`, of each corner's pixels alone, and NaN where those of none are the nearest;
-    means of as many samples as a step has whole pixels.
+    means of as many samples as a step has whole pixels. Of the image no more rows are read than the
+    centres need.
     """
+    around = MARGIN + shape[0] * step[0] / 2
+    ends = np.array([-around, around]) + _ends(centres[..., 0])
+    top, bottom = np.clip(ends, 0, image.shape[0]).astype(int) // 2 * 2 + (0, 2)
+    seen, centres = image.read(slice(int(top), int(bottom)), EVERYTHING), centres - (top, 0)
     bins = _bins(step)
     step = step[0] / bins[0], step[1] / bins[1]
     shape = shape[0] * bins[0], shape[1] * bins[1]
     if not corners:
-        return binned(sampled(image, centres, shape, step), shape, bins)
+        return binned(sampled(seen, centres, shape, step), shape, bins)
     values = np.full((*centres.shape[:-1], *shape), np.nan)
     axes = [
         np.rint(centres[..., axis, None] + (np.arange(n) - (n - 1) / 2) * s) % 2
         for axis, (n, s) in enumerate(zip(shape, step))
     ]
     for row, column in corners:
-        every = image[row::2, column::2]
+        every = seen[row::2, column::2]
         half = step[0] / 2, step[1] / 2
         part = sampled(every, (centres - (row, column)) / 2, shape, half).reshape(values.shape)
         nearest = (axes[0] == row)[..., :, None] & (axes[1] == column)[..., None, :]
         values = np.where(nearest, part, values)
     return binned(values.reshape(*centres.shape[:-1], -1), shape, bins)
+
+
+def _ends(values: np.ndarray) -> np.ndarray:
+    """The least and the greatest of the numbers among values; 0 where there are none."""
+    known = values[np.isfinite(values)]
+    return np.array([known.min(), known.max()] if known.size else [0.0, 0.0])
+
+
+def _extracted(image: Plane, origin: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """As `extract`, of an image of which no more rows are read than are needed."""
+    there = inside(origin, shape, image.shape)
+    first, last = _ends(origin[there, 0]).astype(int)
+    seen = image.read(slice(first, last + shape[0]), EVERYTHING)
+    own = np.where(there[..., None], origin - (first, 0), -1)
+    return extract(seen, own, shape)
 
 
 def _bins(step: tuple[float, float]) -> tuple[int, int]:
@@ -263,20 +300,19 @@ def _tiled(capture: Capture, shape: tuple[int, int], lattice: str, channel: str)
     centre = there(SuperpixelGrid.tiled((rows, columns), shape, lattice).centre)
     origin = np.rint(centre - (np.array(shape) - 1) / 2).astype(int)
 
-    def cut(some: slice) -> np.ndarray:
-        own = origin[some]
-        first, last = int(own[..., 0].min()), int(own[..., 0].max()) + shape[0]
-        seen = capture.window(slice(first, last), EVERYTHING)
+    def usable(some: slice, columns: slice) -> np.ndarray:
+        seen = capture.window(some, columns)
+        corner = some.indices(capture.shape[0])[0] % 2, columns.indices(capture.shape[1])[0] % 2
         signal = seen.signal()
-        colours = cfa_map((signal.shape[0], signal.shape[1]), capture.cfa, (first % 2, 0))
-        usable = colours == channel
+        counts = cfa_map((signal.shape[0], signal.shape[1]), capture.cfa, corner) == channel
         if np.isfinite(seen.levels.white):
-            usable &= ~saturated(seen.mosaic, seen.levels.black, seen.levels.white)
-        return extract(np.where(usable, signal, np.nan), own - (first, 0), shape) / unit
+            counts &= ~saturated(seen.mosaic, seen.levels.black, seen.levels.white)
+        return np.where(counts, signal, np.nan)
 
+    image = Plane(capture.shape, usable)
     return _Superpixels(
         count=(rows, columns),
-        cut=cut,
+        cut=lambda some: _extracted(image, origin[some], shape) / unit,
         read_variance=0.0 if noise is None else noise.without_signal / unit**2,
         gain=0.0 if noise is None else noise.gain / unit,
     )
@@ -289,6 +325,7 @@ def _resampled(
     calibration: Calibration,
     where: str | Path | None,
     channel: str,
+    room: Room,
 ) -> _Superpixels:
     grid, white = calibration.grid, calibration.white
     step = _step(calibration, shape, lattice)
@@ -304,58 +341,111 @@ def _resampled(
         )
     if white is None or white.level is None or white.superpixels is None:
         raise InputError("holds no white image", where, "calibrate with one (--white)")
-    signal = above_dark(capture, calibration)
-    if np.isfinite(capture.levels.white):
-        over = saturated(capture.mosaic, capture.levels.black, capture.levels.white)
-        signal = np.where(over, np.nan, signal)
-    cut = _sampled(signal, grid.centres, shape, step, corners)
+    light = Plane(capture.shape, partial(_light, capture, calibration))
     level = np.where(grid.valid, white.level, np.nan)
     if corners and white.flat is not None:
-        own = cfa_map(white.flat.shape, capture.cfa) == channel
-        level = level * np.nanmean(white.flat[own]) / np.nanmean(white.flat)
+        level = level * _share_of_white(Plane.of(white.flat), capture.cfa, channel)
     usual = float(np.nanmedian(level))
     lit = np.isfinite(level) & (level > DIM * usual)
     # lenslets see less towards the corners, which is no property of the specimen
     even = np.where(lit, level / usual, 1.0)[..., None]
-    windows = there(calibration.windows)
-    raw = extract(signal, windows.origin, windows.shape)
-    seen = np.broadcast_to(white.superpixels, raw.shape)
-    usable = np.isfinite(raw) & np.isfinite(seen) & lit[..., None]
-    noise = pixel_noise(capture, calibration, raw, seen, usable)
-    good = np.isfinite(cut) & lit[..., None]
+    noise = told_noise(capture, calibration) or noise_of_parts(
+        capture, calibration, _beside_white(light, calibration, lit)
+    )
+    dust = None
     if not corners and white.flat is not None and lit.any():
-        seen_white = _sampled(white.flat, grid.centres, shape, step, [])
-        through = _through_dust(seen_white, lit)
-        # the level, too, is that of what dust let through
-        mean = np.nan_to_num(seen_white[lit]).mean(axis=0)
-        shade = np.percentile(mean * through, 98, axis=2) / np.percentile(mean, 98)
-        even = even / shade[..., None]
-        good &= through >= DUST
-        cut = cut / through
-    signal = np.where(good, cut, np.nan) / even / usual
-    if lattice == "hexagonal" and _starts_aside(grid.centres):
-        signal = np.pad(signal, ((1, 0), (0, 0), (0, 0)), constant_values=np.nan)
-    return _Superpixels(
-        count=(signal.shape[0], signal.shape[1]),
-        cut=lambda rows: signal[rows],
+        flat = Plane.of(white.flat)
+        kept = room((math.prod(shape), *lit.shape))
+        dust = _Dust(lambda rows: _sampled(flat, grid.centres[rows], shape, step, []), lit, kept)
+
+    def cut(rows: slice) -> np.ndarray:
+        values, own = _sampled(light, grid.centres[rows], shape, step, corners), even[rows]
+        good = np.isfinite(values) & lit[rows, :, None]
+        if dust is not None:
+            # the level, too, is that of what dust let through
+            through, shade = dust.on(rows)
+            good &= through >= DUST
+            values, own = values / through, own / shade
+        return np.where(good, values, np.nan) / own / usual
+
+    found = _Superpixels(
+        count=lit.shape,
+        cut=cut,
         read_variance=noise.without_signal / usual**2 / math.prod(bins),
         gain=noise.gain / usual / math.prod(bins),
     )
+    aside = lattice == "hexagonal" and _starts_aside(grid.centres)
+    return found.below_nothing() if aside else found
 
 
-def _through_dust(white: np.ndarray, lit: np.ndarray) -> np.ndarray:
-    """What dust lets through of the light of each pixel, 1 where there is none.
+def _light(capture: Capture, calibration: Calibration, rows: slice, columns: slice) -> np.ndarray:
+    """Light (row, column) of a part of the sensor, NaN where it is saturated."""
+    signal = above_dark(capture, calibration, rows)
+    if np.isfinite(capture.levels.white):
+        seen = capture.window(rows, EVERYTHING)
+        over = saturated(seen.mosaic, seen.levels.black, seen.levels.white)
+        signal = np.where(over, np.nan, signal)
+    return signal[:, columns]
 
-    white: (lenslet_row, lenslet_column, pixel) of the white image, NaN where it is not known.
-    lit: (lenslet_row, lenslet_column), which of them count.
+
+def _share_of_white(flat: Plane, cfa: str, channel: str) -> float:
+    """The mean of white on a channel's pixels over that on all."""
+    sums, counts = np.zeros(2), np.zeros(2)
+    for rows in flat.in_bands(2):
+        values = flat.window(rows)
+        own = cfa_map((values.shape[0], values.shape[1]), cfa) == channel
+        for number, some in enumerate((values[own], values)):
+            sums[number] += np.nansum(some)
+            counts[number] += np.isfinite(some).sum()
+    mean = sums / counts
+    return float(mean[0] / mean[1])
+
+
+def _beside_white(
+    light: Plane, calibration: Calibration, lit: np.ndarray
+) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """As noise_of_parts takes them: whole pixels of the superpixels, those of white, and which of
+    them count.
     """
-    found = in_common(white, lit)
-    if found is None:
-        return np.ones(white.shape)
-    typical, spread = found
-    share = np.where(lit[..., None], white, np.nan) / typical
-    unlike = np.abs(share - 1) > np.maximum(UNLIKE * spread, LEAST_DUST)
-    return np.where(unlike, np.maximum(share, MOST_DUST), 1.0)
+    windows, white = there(calibration.windows), there(there(calibration.white).superpixels)
+    pixels = math.prod(windows.shape)
+    for rows in bands(len(lit), AT_ONCE // (pixels * lit.shape[1])):
+        raw = _extracted(light, windows.origin[rows], windows.shape)
+        seen = np.broadcast_to(white if white.ndim == 1 else white[rows], raw.shape)
+        yield raw, seen, np.isfinite(raw) & np.isfinite(seen) & lit[rows, :, None]
+
+
+class _Dust:
+    """What dust lets through of the light of each pixel, as the white image shows it.
+
+    white: gives the superpixels of its rows of lenslets, (row, column, pixel), NaN where a pixel is
+        not known.
+    lit: (lenslet_row, lenslet_column), which of them count.
+    kept: room for them, (pixel, lenslet_row, lenslet_column).
+    """
+
+    def __init__(self, white: Callable[[slice], np.ndarray], lit: np.ndarray, kept: Any) -> None:
+        self._lit, self._white, pixels = lit, kept, kept.shape[0]
+        total = np.zeros(pixels)
+        for rows in bands(len(lit), AT_ONCE // (pixels * lit.shape[1])):
+            own = white(rows)
+            self._white[:, rows] = np.moveaxis(own, 2, 0)
+            total += np.nan_to_num(own[lit[rows]]).sum(axis=0, dtype=float)
+        self._mean = total / lit.sum()
+        self._common = in_common(self._white, lit)
+
+    def on(self, rows: slice) -> tuple[np.ndarray, np.ndarray]:
+        """Of some rows of lenslets: the share (row, column, pixel), 1 where there is no dust, and
+        that of their brightness, (row, column, 1).
+        """
+        white, lit = np.moveaxis(self._white[:, rows], 0, 2), self._lit[rows, :, None]
+        through = np.ones(white.shape)
+        if self._common is not None:
+            share = np.where(lit, white, np.nan) / self._common.typical(rows)
+            unlike = np.abs(share - 1) > np.maximum(UNLIKE * self._common.spread, LEAST_DUST)
+            through = np.where(unlike, np.maximum(share, MOST_DUST), 1.0)
+        bright = np.percentile(self._mean * through, 98, axis=2) / np.percentile(self._mean, 98)
+        return through, bright[..., None]
 
 
 def _starts_aside(centres: np.ndarray) -> bool:

@@ -115,7 +115,7 @@ def run_volume(
     from plenocli.files.artefacts.provenance import Provenance, describe_inputs
     from plenocli.files.atomic import check_output
     from plenocli.files.images.mosaic import capture_in_file
-    from plenocli.files.read.calibrations import read_calibration
+    from plenocli.files.read.calibrations import read_images
     from plenocli.files.results.stacks import read_stack
     from plenocli.files.results.volumes import read_volume, same_voxels
     from plenocli.files.scratch import Scratch
@@ -130,7 +130,9 @@ def run_volume(
     other = None if like is None else read_volume(like, in_file=True)
     there = device_of(device)
     stack = read_stack(pif)
-    known = None if calibration is None else read_calibration(calibration, response=False)
+    known = None
+    if calibration is not None:
+        known = read_images(calibration, small=True, superpixels=True)
     room = Scratch(output)
     measurement = measured(
         capture_in_file(capture, cfa=None if known is None else known.sensor.cfa),

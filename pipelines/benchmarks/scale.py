@@ -1,10 +1,12 @@
-"""Time, memory and bytes of whole sensors: capture-sim, reconstruct, demux and refocus against
-lenslets, points, workers and device.
+"""Time, memory and bytes of whole sensors: capture-sim, reconstruct, demux, refocus and volume
+against lenslets, points, workers and device.
 
 Cameras are seed_spatial with more lenslets (`seed`: 52x52 pixels and 40x40 points a lenslet, or
 `small`: 15x15 and 12x12), the scene is the astronaut spread over all lenslets at 50 dB; methods are
 those of reconstruct, and `refocus`. `spectral` is seed_spectral with 15x15 pixels a lenslet, which
-is calibrated (a response of its own for every lenslet); methods are those of demux. Every
+is calibrated (a response of its own for every lenslet); methods are those of demux. `microscope`
+is sample_configs/microscope with four planes of 2x2 voxels and 15x15 pixels a lenslet; its capture
+is that of beads before 32x32 lenslets, side by side; methods are those of volume. Every
 command is a process of its own, of one thread; its CPU seconds (user and system, workers
 included), seconds by the clock, its highest resident memory and the bytes of its file are lines
 of RUN/scale.jsonl. What stands there is not measured again. RUN/scale.md has the table, with the
@@ -16,6 +18,8 @@ Run from the project's root:
 python pipelines/benchmarks/scale.py RUN --kind small --lenslets 1024 4096 16384 65536 129960
 python pipelines/benchmarks/scale.py RUN --kind spectral --methods pinv --mem-limit 512MiB \
     --lenslets 16384 65536 129960
+python pipelines/benchmarks/scale.py RUN --kind microscope --methods rl lmmse --mem-limit 512MiB \
+    --lenslets 1024 16384 65536 129960
 """
 
 import argparse
@@ -26,6 +30,7 @@ import re
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -37,6 +42,13 @@ SMALL = {
     '"832 um"': '"240 um"',
 }
 BANDS = "450nm", "540nm", "570nm", "650nm"
+BESIDE = 32
+"""Lenslets along each side of the capture that a microscope's captures are made of."""
+VOLUME = {
+    '"-12 um to 12 um step 1 um"': '["-6 um", "-3 um", "3 um", "6 um"]',
+    "samples_per_lenslet = [3, 3]": "samples_per_lenslet = [2, 2]",
+    "count = [29, 29]": f"count = [{BESIDE}, {BESIDE}]",
+}
 WHOLE = 130_000
 ON_DEVICE = "pnp", "auto"
 
@@ -68,8 +80,9 @@ def measured(tree, command):
 
 def commands(run, kind, lenslets, chosen):
     """(name, command, its file) of one size; the matrix serves all sizes of a kind."""
-    if kind == "spectral":
-        yield from spectral_commands(run, lenslets, chosen)
+    if kind in ("spectral", "microscope"):
+        of_kind = spectral_commands if kind == "spectral" else volume_commands
+        yield from of_kind(run, lenslets, chosen)
         return
     text, count = described(kind, lenslets)
     superpixels, limit = chosen.superpixels, chosen.mem_limit
@@ -117,6 +130,46 @@ def spectral_commands(run, lenslets, chosen):
         yield count, f"demux {method}", ["demux", shot, *options, *limits], out
 
 
+def volume_commands(run, lenslets, chosen):
+    """As commands, of volume; kernels and a small capture are made once."""
+    text = (ROOT / "sample_configs/microscope.toml").read_text()
+    for old, new in VOLUME.items():
+        text = text.replace(old, new)
+    camera, pif, beads = (run / f"microscope{end}" for end in (".toml", "-pif.h5", "-beads.h5"))
+    camera.write_text(text)
+    if not beads.exists():
+        measured(ROOT, ["simulate-pif", camera, "-o", pif, "--overwrite"])
+        expose = ["capture-sim", camera, "--volume", "phantom:beads", "--snr", "40dB"]
+        measured(ROOT, [*expose, "-o", beads])
+    rows = int(lenslets**0.5)
+    count = rows, round(lenslets / rows)
+    lenslets = count[0] * count[1]
+    shot = run / f"microscope-{lenslets}.h5"
+    if not shot.exists():
+        side_by_side(beads, count, shot)
+    for method in chosen.methods:
+        out = run / f"microscope-{lenslets}-{method}.h5"
+        command = ["volume", shot, "--pif", pif, "--method", method, "-o", out, "--overwrite"]
+        yield lenslets, f"volume {method}", [*command, "--mem-limit", chosen.mem_limit], out
+
+
+def side_by_side(beads, count, path):
+    """Write a capture of `count` (rows, columns) lenslets that repeats a small one."""
+    import numpy as np
+
+    sys.path.insert(0, str(ROOT))
+    from plenocli.files.artefacts.provenance import Provenance
+    from plenocli.files.images.mosaic import read_capture, write_capture
+
+    small = read_capture(beads)
+    times = [-(-n // BESIDE) for n in count]
+    rows, columns = (n * s for n, s in zip(count, small.grid.shape))
+    whole = np.tile(small.mosaic, times)[:rows, :columns]
+    grid = replace(small.grid, count=count, centre=None)
+    made = replace(small, mosaic=np.ascontiguousarray(whole), grid=grid)
+    write_capture(path, made, Provenance(command="side by side"))
+
+
 def exponents(lines):
     """(of time, of memory) of lines of one command by lenslets, None for less than two sizes."""
     import numpy as np
@@ -156,7 +209,8 @@ def main():
     """Measure what is not measured yet, and write the table."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("run", type=Path)
-    parser.add_argument("--kind", choices=["seed", "small", "spectral"], default="small")
+    kinds = ["seed", "small", "spectral", "microscope"]
+    parser.add_argument("--kind", choices=kinds, default="small")
     parser.add_argument("--lenslets", type=int, nargs="+", default=[121, 1024, 4096])
     parser.add_argument("--methods", nargs="+", default=["lmmse"])
     parser.add_argument("--workers", type=int, nargs="+", default=[1])
@@ -170,7 +224,9 @@ def main():
     log = run / "scale.jsonl"
     lines = [json.loads(text) for text in log.read_text().splitlines()] if log.exists() else []
     trees = {"new": ROOT} | ({"old": chosen.old.resolve()} if chosen.old else {})
-    kind = chosen.kind if chosen.kind == "spectral" else f"{chosen.kind} {chosen.superpixels}"
+    kind = f"{chosen.kind} {chosen.superpixels}"
+    if chosen.kind in ("spectral", "microscope"):
+        kind = chosen.kind
     for lenslets in chosen.lenslets:
         jobs = commands(run, chosen.kind, lenslets, chosen)
         for count, name, command, file in jobs:

@@ -177,16 +177,17 @@ class BlockCirculant:
 
     @staticmethod
     def needed(
-        pixels: int, unknowns: int, torus: tuple[int, int], itemsize: int = 4
+        pixels: int, unknowns: int, torus: tuple[int, int], itemsize: int = 4, parts: int = 1
     ) -> tuple[int, int]:
         """Bytes of a spectrum, and those that making it takes beside it.
 
         pixels, unknowns: of a lenslet.
         torus: (rows, columns) of lenslets.
         itemsize: of the kernels' numbers.
+        parts: that the unknowns are in, all alike.
         """
         frequencies = torus[0] * (torus[1] // 2 + 1)
-        kernels = itemsize * pixels * unknowns * torus[0] * torus[1]
+        kernels = itemsize * pixels * unknowns // parts * torus[0] * torus[1]
         return 2 * itemsize * pixels * unknowns * frequencies, 4 * min(CHUNK, kernels)
 
     def _transform(self, blocks: np.ndarray, offsets: np.ndarray, unknowns: slice) -> None:

@@ -96,7 +96,8 @@ class Tiles:
         the least the smallest.
         """
         halo, reach = _halo(self.stack), self.stack.reach
-        pixels, unknowns = self.stack.A.shape[1], len(self.stack.depth) * self.stack.A.shape[2]
+        pixels, planes = self.stack.A.shape[1], len(self.stack.depth)
+        unknowns = planes * self.stack.A.shape[2]
         kept = HELD_BYTES * self._hold_out * math.prod(count) * pixels
         fewest, fitting = math.inf, dict[tuple[int, int], tuple[int, int]]()
         for rows in range(1, count[0] + 1):
@@ -105,13 +106,13 @@ class Tiles:
                     break
                 size = _size(count[0], rows, halo), _size(count[1], columns, halo)
                 torus = torus_for(size, reach)
-                if _needed(self.method, pixels, unknowns, torus) + kept <= budget().memory:
+                if _needed(self.method, pixels, unknowns, planes, torus) + kept <= budget().memory:
                     fewest = min(fewest, rows * columns)
                     fitting[rows, columns] = torus
         if not fitting:
             smallest = _size(count[0], count[0], halo), _size(count[1], count[1], halo)
             budget().require(
-                kept + _needed(self.method, pixels, unknowns, torus_for(smallest, reach)),
+                kept + _needed(self.method, pixels, unknowns, planes, torus_for(smallest, reach)),
                 f"the map of {smallest[0]} x {smallest[1]} lenslets",
                 self._where,
                 "take fewer planes or voxels",
@@ -323,10 +324,10 @@ def _weights(start: int, size: int, count: int, halo: int) -> np.ndarray:
     return np.clip(inside / (2 * fade), 1e-6, 1.0)
 
 
-def _needed(method: str, pixels: int, unknowns: int, torus: tuple[int, int]) -> int:
-    """Bytes that a method takes on a torus, in single precision."""
+def _needed(method: str, pixels: int, unknowns: int, planes: int, torus: tuple[int, int]) -> int:
+    """Bytes that a method takes on a torus, in single precision; unknowns: of all planes."""
     frequencies = torus[0] * (torus[1] // 2 + 1)
-    spectrum, making = BlockCirculant.needed(pixels, unknowns, torus)
+    spectrum, making = BlockCirculant.needed(pixels, unknowns, torus, parts=planes)
     arrays = 48 * torus[0] * torus[1] * (pixels + unknowns)
     gain = 8 * frequencies * pixels * unknowns + 128 * unknowns * (unknowns + pixels)
     most = {"rl": arrays, "lmmse": arrays + gain, "tikhonov": arrays + gain}

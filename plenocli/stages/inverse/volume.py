@@ -15,7 +15,9 @@ from plenocli.base.units import format_length
 if TYPE_CHECKING:
     from plenocli.files.artefacts.provenance import Provenance
     from plenocli.files.results.volumes import StoredVolume
+    from plenocli.files.scratch import Scratch
     from plenocli.forward.volume.stack import Stack
+    from plenocli.inverse.volume.measurement import Measurement
     from plenocli.inverse.volume.tiles import Tiles
     from plenocli.inverse.volume.volume import Trial, Volume
 
@@ -114,12 +116,9 @@ def run_volume(
     from plenocli.base.device import device as device_of
     from plenocli.files.artefacts.provenance import Provenance, describe_inputs
     from plenocli.files.atomic import check_output
-    from plenocli.files.images.mosaic import capture_in_file
-    from plenocli.files.read.calibrations import read_images
     from plenocli.files.results.stacks import read_stack
     from plenocli.files.results.volumes import read_volume, same_voxels
     from plenocli.files.scratch import Scratch
-    from plenocli.inverse.volume.superpixels import measured
     from plenocli.inverse.volume.tiles import Tiles
 
     output = Path(output)
@@ -130,15 +129,11 @@ def run_volume(
     other = None if like is None else read_volume(like, in_file=True)
     there = device_of(device)
     stack = read_stack(pif)
-    known = None
-    if calibration is not None:
-        known = read_images(calibration, small=True, superpixels=True)
     room = Scratch(output)
-    measurement = measured(
-        capture_in_file(capture, cfa=None if known is None else known.sensor.cfa),
+    measurement = _looked_at(
+        capture,
         stack,
-        known,
-        where=calibration,
+        calibration,
         background=0.0 if background == "auto" else background,
         channel=channel,
         room=room,
@@ -173,6 +168,35 @@ def run_volume(
     if other is not None and summary.explained_db is not None:
         _tell_of_the_clearer(summary.explained_db, other, str(like))
     return summary
+
+
+def _looked_at(
+    capture: Path | str,
+    stack: Stack,
+    calibration: Path | str | None,
+    *,
+    background: float,
+    channel: str | None,
+    room: Scratch,
+) -> Measurement:
+    """Superpixels of a capture in `room`; what they are made of is let go."""
+    from plenocli.files.images.mosaic import capture_in_file
+    from plenocli.files.read.calibrations import read_images
+    from plenocli.inverse.volume.superpixels import measured
+
+    known, cfa = None, None
+    if calibration is not None:
+        known = read_images(calibration, small=True, superpixels=True)
+        cfa = known.sensor.cfa
+    return measured(
+        capture_in_file(capture, cfa=cfa),
+        stack,
+        known,
+        where=calibration,
+        background=background,
+        channel=channel,
+        room=room,
+    )
 
 
 def _summary(output: Path, volume: Volume, stack: Stack) -> VolumeSummary:

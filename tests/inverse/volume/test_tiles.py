@@ -62,7 +62,7 @@ def memory_of(method, several, count=COUNT, halo=1):
     """Bytes with which windows as many as this fit, and no fewer."""
     size = [tiles._size(n, m, halo) for n, m in zip(count, several)]
     kept = tiles.HELD_BYTES * 0.1 * np.prod(count) * 9
-    return math.ceil(tiles._needed(method, 9, 8, tiles.torus_for(tuple(size), (1, 1))) + kept)
+    return math.ceil(tiles._needed(method, 9, 8, 2, tiles.torus_for(tuple(size), (1, 1))) + kept)
 
 
 @pytest.fixture(autouse=True)
@@ -204,7 +204,9 @@ def test_windows_fit_and_are_the_least_work(stack, measurement):
                     work[rows, columns] = rows * columns * area
         area = math.prod(tiles.torus_for(found[0].weight.shape, (1, 1)))
         assert len(found) * area == min(work.values())
-        assert tiles._needed("rl", 9, 8, tiles.torus_for(found[0].weight.shape, (1, 1))) <= memory
+        assert (
+            tiles._needed("rl", 9, 8, 2, tiles.torus_for(found[0].weight.shape, (1, 1))) <= memory
+        )
 
 
 def test_what_does_not_fit_even_so_is_refused(stack, measurement):

@@ -11,21 +11,27 @@ import pytest
 import tifffile
 from PIL import Image
 
+from plenocli.base.budget import Budget, within
 from plenocli.base.errors import ConfigError, InputError, NumericsError, OutputError, UsageError
 from plenocli.base.progress import collected_notes
 from plenocli.cli.sections import read_options
+from plenocli.files import scratch
+from plenocli.files.artefacts import reading
 from plenocli.files.artefacts.reading import read_artefact
 from plenocli.files.artefacts.writing import write_artefact
 from plenocli.files.images.mosaic import read_capture
 from plenocli.files.images.tiff_stack import read_tiff_volume, write_volume_tiff
 from plenocli.files.results.stacks import read_stack
 from plenocli.files.results.volumes import read_volume
+from plenocli.inverse.volume import measurement, superpixels
 from plenocli.inverse.volume.superpixels import white_superpixel
+from plenocli.inverse.volume.tiles import Tiles
 from plenocli.stages.evaluation.score.run import run_score
 from plenocli.stages.forward.capture_settings import Settings as Capture
 from plenocli.stages.forward.capture_sim import run_capture_sim
 from plenocli.stages.forward.simulate_pif import Settings, run_simulate_pif
 from plenocli.stages.forward.simulate_stack import StackSummary
+from plenocli.stages.inverse import volume as stage
 from plenocli.stages.inverse.refocus import Settings as Refocus
 from plenocli.stages.inverse.refocus import run_refocus
 from plenocli.stages.inverse.volume import run_volume
@@ -316,6 +322,51 @@ def test_a_volume_for_fiji_has_its_errors_beside_it(seen, tmp_path):
     with tifffile.TiffFile(tmp_path / "v.ome.tif") as file:
         assert file.series[0].axes == "ZCYX"
         assert np.array_equal(file.asarray()[:, 1], stored.sigma)
+
+
+@pytest.mark.parametrize("method", ["lmmse", "tv"])
+def test_a_volume_whose_parts_stay_in_files_is_that_of_all_in_memory(
+    seen, tmp_path, method, monkeypatch
+):
+    """The same windows; a few pixels at a time, the capture and what it is like in their files."""
+    run_volume(seen / "capture.h5", tmp_path / "like.h5", seen / "stack.h5", method="rl")
+    more = {"like": tmp_path / "like.h5"} if method == "tv" else {}
+    monkeypatch.setattr(Tiles, "_several", lambda self, count: (3, 2))
+
+    def made(name):
+        path = tmp_path / name
+        run_volume(seen / "capture.h5", path, seen / "stack.h5", method=method, **more)
+        return path
+
+    whole = read_artefact(made("whole.h5"), "volume")
+    monkeypatch.setattr(reading, "SHARE", 1 << 40)
+    for module in (measurement, superpixels):
+        monkeypatch.setattr(module, "AT_ONCE", 700)
+    monkeypatch.setattr(scratch, "BAND", 30)
+    parts = read_artefact(made("parts.h5"), "volume")
+    assert len(whole.attrs["volume"]["trace"]) > 1
+    assert whole.data.keys() == parts.data.keys()
+    for name, values in whole.data.items():
+        np.testing.assert_allclose(parts.data[name], values, rtol=1e-4, atol=1e-5 * values.max())
+    stack = read_tiff_volume(made("v.ome.tif"))
+    assert np.array_equal(stack.value, parts.data["volume/value"])
+
+
+def test_an_ome_tiff_without_room_is_refused_before_the_work(seen, tmp_path, monkeypatch):
+    """3 planes of 14 x 12 voxels with errors, 3 times 4 bytes each, at the very limit."""
+    monkeypatch.setattr(Tiles, "_several", lambda self, count: (1, 1))
+    needed = 3 * 4 * 2 * 3 * 14 * 12
+    monkeypatch.setattr(Tiles, "volume", lambda self: pytest.fail("it worked"))
+    monkeypatch.setattr(stage, "COPIES", stage.COPIES * (1 << 20))
+    files = seen / "capture.h5", tmp_path / "v.ome.tif", seen / "stack.h5"
+    with (
+        within(Budget((needed << 20) - 1)),
+        pytest.raises(NumericsError, match=r"an OME-TIFF of this volume needs about 11\.9GiB"),
+    ):
+        run_volume(*files, method="lmmse", background=0.0)
+    assert [path.name for path in tmp_path.iterdir()] == []
+    with within(Budget(needed << 20)), pytest.raises(pytest.fail.Exception, match="it worked"):
+        run_volume(*files, method="lmmse", background=0.0)
 
 
 def test_a_capture_of_another_camera_is_refused(seen, tmp_path):

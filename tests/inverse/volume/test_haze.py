@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from plenocli.base.linear_maps import BlockCirculant
+from plenocli.inverse.volume import measurement
 from plenocli.inverse.volume.haze import haze, without_haze
 from plenocli.inverse.volume.measurement import Measurement, Problem, Voxels
 from plenocli.inverse.volume.richardson_lucy import richardson_lucy
@@ -60,6 +61,25 @@ def test_pixels_that_count_behind_no_lenslet_hide_no_haze():
     signal[..., 0] = signal[2, 3] = np.nan
     found = haze(Measurement(signal=signal, read_variance=0.0))
     assert found == pytest.approx(0.95 * np.array([0.0, 2.0, 3.0, 4.0]))
+
+
+def test_haze_in_bands_is_that_of_one_sort_of_all_lenslets(monkeypatch):
+    """Written out for all at once."""
+    rng = np.random.default_rng(9)
+    signal = rng.gamma(2.0, 1.0, (23, 11, 1)) * (1 + 0.3 * rng.random((23, 11, 7)))
+    signal[rng.random(signal.shape) < 0.03] = np.nan
+    signal[..., 6] = np.nan
+    monkeypatch.setattr(measurement, "AT_ONCE", 200)
+    found = haze(Measurement(signal=signal, read_variance=0.0))
+    flat = signal.reshape(-1, 7)
+    known = np.isfinite(flat).sum(axis=1)
+    flat = flat[known >= 0.8 * known.max()]
+    usual = np.nanmean(flat[:, :6], axis=0)
+    seen = np.isfinite(flat[:, :6])
+    level = np.nansum(flat, axis=1) / (seen * usual).sum(axis=1)
+    darkest = np.argsort(level)[: int(0.05 * len(flat))]
+    assert found[:6] == pytest.approx(0.95 * np.nanmean(flat[darkest, :6], axis=0))
+    assert found[6] == 0
 
 
 def test_too_few_lenslets_have_no_haze():

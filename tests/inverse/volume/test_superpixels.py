@@ -8,8 +8,12 @@ import numpy as np
 import pytest
 
 from plenocli.base.errors import InputError, UsageError
-from plenocli.forward.sensor.capture import Capture
+from plenocli.base.tiling import Plane
+from plenocli.files.scratch import Scratch
+from plenocli.forward.sensor.capture import Capture, Levels, SuperpixelGrid
 from plenocli.forward.sensor.noise import Noise
+from plenocli.inverse.picture import real_light
+from plenocli.inverse.volume import superpixels
 from plenocli.inverse.volume.superpixels import measured
 from tests.reference.calibrations import drawn_calibration, lenslet_grid
 
@@ -195,3 +199,65 @@ def test_pixels_whose_white_is_below_the_dark_level_are_no_dust():
         found = measured(Capture(mosaic=200 * light), stack, known)
     usable = np.isfinite(found.signal).reshape(*COUNT, 13, 13)
     assert usable[..., 6, 6].all() and not usable[..., 0, 0].any()
+
+
+@pytest.mark.parametrize("kind", ["square", "tells its noise", "hexagonal", "tiles"])
+@pytest.mark.parametrize("channel", [None, "G"])
+def test_superpixels_in_bands_are_those_of_all_at_once(kind, channel, monkeypatch, tmp_path):
+    """A few lenslets at a time, of a mosaic, a white and a dark image that are read in windows, put
+    into a file; with dust, a lenslet that does not count, and pixels that are saturated.
+    """
+    rng, count = np.random.default_rng(8), (20, 8)
+    hexagonal, tiles = kind == "hexagonal", kind == "tiles"
+    index = np.stack(np.meshgrid(*map(np.arange, count), indexing="ij"), axis=-1)
+    centres = np.array([12.3, 12.6]) + index * np.array([13.0, 14.0] if hexagonal else [14.2, 14.4])
+    centres[::2, :, 1] += 7.0 * hexagonal  # the first row aside
+    shape = (280, 112) if tiles else (310, 146)
+    light = drawn(centres, shape, rng.uniform(0.2, 1, count)) + rng.normal(0, 0.01, shape)
+    white = 200 * drawn(centres, shape, np.ones(count)) + rng.normal(0, 0.5, shape)
+    white[200:207, 60:66] *= 0.3
+    mosaic = np.rint(200 * light + 20).astype(np.float32)
+    mosaic[100:104, 40:44] = 999
+    colour = "mono" if channel is None else "RGGB"
+    shot = Capture(
+        mosaic=mosaic,
+        cfa=colour,
+        levels=Levels(black=np.array([[20.0, 21.0], [19.0, 20.0]]), white=900.0),
+        noise=Noise(gain=0.5, read_variance=9.0) if kind == "tells its noise" else None,
+        grid=SuperpixelGrid(shape=(14, 14), count=count) if tiles else None,
+    )
+    basis = [[13.0, 7.0], [0.0, 14.0]] if hexagonal else np.diag([14.2, 14.4])
+    grid = lenslet_grid(centres, np.array(basis), "hexagonal" if hexagonal else "square")
+    known = None if tiles else drawn_calibration(grid, white, colour)
+    grid.valid[3, 5] = False
+    stack = SimpleNamespace(
+        lattice="hexagonal" if hexagonal else "square",
+        lenslets=1 + hexagonal,
+        pixel_shape=(26 if hexagonal else 14, 14),
+        even=lambda: np.ones(14 * (26 if hexagonal else 14)),
+    )
+    whole = measured(shot, stack, known, channel=channel)
+    monkeypatch.setattr(superpixels, "AT_ONCE", 3500)
+    monkeypatch.setattr(superpixels, "MARGIN", 40)
+    monkeypatch.setattr(real_light, "MEDIANS", 3000)
+    monkeypatch.setattr("plenocli.base.tiling.BAND", 3500)
+    reads = []
+
+    def in_file(image):
+        def read(rows, columns):
+            reads.append(image[rows].shape[0])
+            return image[rows, columns]
+
+        return Plane(image.shape, read)
+
+    if known is not None:
+        flat, dark = in_file(known.white.flat), replace(known.dark, mean=in_file(known.dark.mean))
+        known = replace(known, white=replace(known.white, flat=flat), dark=dark)
+    stored = replace(shot, mosaic=in_file(mosaic))
+    found = measured(stored, stack, known, channel=channel, room=Scratch(tmp_path / "v.h5"))
+    assert max(reads) < shape[0] / 2
+    signal = found.signal.whole()
+    assert np.isfinite(whole.signal).mean() > (0.15 if channel else 0.4)
+    np.testing.assert_allclose(signal, whole.signal, atol=2e-6, rtol=2e-6)
+    assert found.gain == pytest.approx(whole.gain, rel=1e-6)
+    assert found.read_variance == pytest.approx(whole.read_variance, rel=1e-6)

@@ -16,12 +16,13 @@ from plenocli.base.budget import budget
 from plenocli.base.device import CPU, Device
 from plenocli.base.linear_maps import BlockCirculant, torus_for
 from plenocli.base.progress import bar
+from plenocli.base.tiling import bands
 from plenocli.forward.volume.stack import Stack
 from plenocli.inverse.volume import total_variation
 from plenocli.inverse.volume.choose import as_before, volume_of
 from plenocli.inverse.volume.haze import haze, without_haze
 from plenocli.inverse.volume.lattice import map_of, voxels_of
-from plenocli.inverse.volume.measurement import SEEN, Measurement, Problem, put_aside
+from plenocli.inverse.volume.measurement import AT_ONCE, SEEN, Measurement, Problem, put_aside
 from plenocli.inverse.volume.volume import HeldOut, Trial, Volume, predictive_sigma
 
 MOST = 10_000
@@ -264,9 +265,12 @@ class _Joined:
         """Every pixel that was put aside."""
         flat, measured, predicted = (np.concatenate(parts) for parts in zip(*self._aside))
         self._aside.clear()
-        places = np.unravel_index(flat, self._tiles.measurement.signal.shape)
+        index = np.empty((len(flat), 3), np.int32)
+        for some in bands(len(flat), AT_ONCE):
+            places = np.unravel_index(flat[some], self._tiles.measurement.signal.shape)
+            index[some] = np.stack(places, axis=1)
         return HeldOut(
-            index=np.stack([place.astype(np.int32) for place in places], axis=1),
+            index=index,
             measured=measured,
             predicted=predicted,
             sigma=predictive_sigma(measured, predicted),

@@ -7,8 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from plenocli.base.tiling import bands
+
 BARS = 1.959964
 """Standard deviations that hold 95 % of normal errors."""
+AT_ONCE = 1 << 18
+"""Pixels that are worked on together: temporary arrays are no larger."""
 ROUNDS = 8
 """Of reweighting, after which a law of variance stands still."""
 
@@ -86,16 +90,33 @@ def variance_law(law: np.ndarray, square: np.ndarray) -> np.ndarray:
     law: (n, term) values of the terms.
     square: (n,) squared errors.
     """
-    from scipy.optimize import nnls
-
-    if not len(square):
+    unit = float(square.mean()) if len(square) else 0.0
+    if not unit:
         return np.zeros(law.shape[1])
     scale = np.maximum(law.max(axis=0), np.finfo(float).tiny)
-    variance = np.full(len(square), max(square.mean(), np.finfo(float).tiny))
+    variance = np.ones(len(square))
+    some = bands(len(square), AT_ONCE)
     for _ in range(ROUNDS):
-        found = nnls(law / scale / variance[:, None], square / variance)[0]
-        variance = np.maximum(law / scale @ found, 1e-3 * variance.mean())
-    return found / scale
+        gram, along = np.zeros((len(scale), len(scale))), np.zeros(len(scale))
+        for part in some:
+            terms = law[part] / scale / variance[part, None]
+            gram += terms.T @ terms
+            along += terms.T @ (square[part] / unit / variance[part])
+        found, least = _non_negative(gram, along), 1e-3 * variance.mean()
+        for part in some:
+            variance[part] = np.maximum(law[part] / scale @ found, least)
+    return unit * found / scale
+
+
+def _non_negative(gram: np.ndarray, along: np.ndarray) -> np.ndarray:
+    """x >= 0 of the least |B x - y|, by B' B (term, term) and B' y (term,)."""
+    from scipy.optimize import nnls
+
+    values, vectors = np.linalg.eigh(gram)
+    told = values > np.finfo(float).eps * values[-1]
+    root = np.sqrt(np.where(told, values, 0))
+    right = np.divide(vectors.T @ along, root, out=np.zeros_like(along), where=told)
+    return nnls(root[:, None] * vectors.T, right)[0]
 
 
 @dataclass(frozen=True, kw_only=True)

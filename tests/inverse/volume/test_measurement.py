@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.optimize import nnls
 
 from plenocli.base.errors import NumericsError
 from plenocli.base.linear_maps import BlockCirculant
@@ -103,3 +104,19 @@ def test_a_law_of_variance_has_no_negative_part():
     law = np.stack([np.ones(500), level], axis=1)
     np.testing.assert_allclose(variance_law(law, 2 + 3 * level), [2, 3], rtol=1e-6)
     assert np.all(variance_law(law, 2 - level) >= 0)
+    assert not variance_law(law, 0 * level).any()
+
+
+def test_a_law_of_variance_is_that_of_weighted_least_squares(monkeypatch):
+    """Against rounds over all pixels at once; here a few hundred at a time."""
+    rng = np.random.default_rng(12)
+    level = rng.exponential(3e-4, 4000)
+    law = np.stack([np.ones(4000), level, level**2], axis=1)
+    square = (1e-8 + 2e-5 * level) * rng.standard_normal(4000) ** 2
+    variance = np.full(4000, square.mean())
+    scale = law.max(axis=0)
+    for _ in range(8):
+        expected = nnls(law / scale / variance[:, None], square / variance)[0] / scale
+        variance = np.maximum(law @ expected, 1e-3 * variance.mean())
+    monkeypatch.setattr("plenocli.inverse.volume.volume.AT_ONCE", 300)
+    np.testing.assert_allclose(variance_law(law, square), expected, rtol=1e-7, atol=1e-12)

@@ -158,15 +158,21 @@ def side_by_side(beads, count, path):
     import numpy as np
 
     sys.path.insert(0, str(ROOT))
+    from plenocli.base.tiling import InParts
     from plenocli.files.artefacts.provenance import Provenance
     from plenocli.files.images.mosaic import read_capture, write_capture
 
     small = read_capture(beads)
-    times = [-(-n // BESIDE) for n in count]
     rows, columns = (n * s for n, s in zip(count, small.grid.shape))
-    whole = np.tile(small.mosaic, times)[:rows, :columns]
+    # in bands: what this process takes counts for those that it starts
+    across = np.tile(small.mosaic, (1, -(-count[1] // BESIDE)))[:, :columns]
+    whole = InParts(
+        shape=(rows, columns),
+        dtype=across.dtype,
+        parts=lambda: (across[: rows - top] for top in range(0, rows, len(across))),
+    )
     grid = replace(small.grid, count=count, centre=None)
-    made = replace(small, mosaic=np.ascontiguousarray(whole), grid=grid)
+    made = replace(small, mosaic=whole, grid=grid)
     write_capture(path, made, Provenance(command="side by side"))
 
 

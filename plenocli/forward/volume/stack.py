@@ -7,6 +7,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -89,11 +90,10 @@ class Stack:
         )
 
     def parts(self) -> list[tuple[np.ndarray, np.ndarray]]:
-        """(kernels (offset, pixel, point), offsets (offset, 2)) plane by plane."""
-        return [
-            (self.A[self.plane == z], self.lenslet_offset[self.plane == z])
-            for z in range(len(self.depth))
-        ]
+        """(kernels (offset, pixel, point), offsets (offset, 2)) plane by plane, as views."""
+        ends = np.searchsorted(self.plane, np.arange(len(self.depth) + 1))
+        some = [slice(*both) for both in pairwise(ends.tolist())]
+        return [(self.A[part], self.lenslet_offset[part]) for part in some]
 
 
 def build_stack(

@@ -99,7 +99,7 @@ class Tiles:
         halo, reach = _halo(self.stack), self.stack.reach
         pixels, planes = self.stack.A.shape[1], len(self.stack.depth)
         unknowns = planes * self.stack.A.shape[2]
-        kept = HELD_BYTES * self._hold_out * math.prod(count) * pixels
+        kept = HELD_BYTES * self._hold_out * math.prod(count) * pixels + self.stack.A.nbytes
         fewest, fitting = math.inf, dict[tuple[int, int], tuple[int, int]]()
         for rows in range(1, count[0] + 1):
             for columns in range(1, count[1] + 1):

@@ -61,7 +61,8 @@ def tiled(stack, measurement, method, memory=1 << 40, like=None):
 def memory_of(method, several, count=COUNT, halo=1):
     """Bytes with which windows as many as this fit, and no fewer."""
     size = [tiles._size(n, m, halo) for n, m in zip(count, several)]
-    kept = tiles.HELD_BYTES * 0.1 * np.prod(count) * 9
+    kernels = sum(4 * blocks.size for blocks, _ in volumes.kernels(2, 4, 9))
+    kept = tiles.HELD_BYTES * 0.1 * np.prod(count) * 9 + kernels
     return math.ceil(tiles._needed(method, 9, 8, 2, tiles.torus_for(tuple(size), (1, 1))) + kept)
 
 

@@ -1,5 +1,5 @@
-"""Time, memory and bytes of whole sensors: capture-sim, reconstruct, demux, refocus and volume
-against lenslets, points, workers and device.
+"""Time, memory and bytes of whole sensors: capture-sim, reconstruct, demux and refocus against
+lenslets, points, workers and device.
 
 Cameras are seed_spatial with more lenslets (`seed`: 52x52 pixels and 40x40 points a lenslet, or
 `small`: 15x15 and 12x12), the scene is the astronaut spread over all lenslets at 50 dB; methods are
@@ -34,6 +34,13 @@ from dataclasses import replace
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
+BESIDE = 32
+"""Lenslets along each side of the capture that a microscope's captures are made of."""
+VOLUME = {
+    '"-12 um to 12 um step 1 um"': '["-6 um", "-3 um", "3 um", "6 um"]',
+    "samples_per_lenslet = [3, 3]": "samples_per_lenslet = [2, 2]",
+    "count = [29, 29]": f"count = [{BESIDE}, {BESIDE}]",
+}
 SMALL = {
     "samples_per_lenslet = [40, 40]": "samples_per_lenslet = [12, 12]",
     "samples_per_lenslet = [12, 12] ": "samples_per_lenslet = [6, 6] ",
@@ -42,13 +49,6 @@ SMALL = {
     '"832 um"': '"240 um"',
 }
 BANDS = "450nm", "540nm", "570nm", "650nm"
-BESIDE = 32
-"""Lenslets along each side of the capture that a microscope's captures are made of."""
-VOLUME = {
-    '"-12 um to 12 um step 1 um"': '["-6 um", "-3 um", "3 um", "6 um"]',
-    "samples_per_lenslet = [3, 3]": "samples_per_lenslet = [2, 2]",
-    "count = [29, 29]": f"count = [{BESIDE}, {BESIDE}]",
-}
 WHOLE = 130_000
 ON_DEVICE = "pnp", "auto"
 

@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from plenocli.base.budget import Budget, one_thread, within
+from plenocli.base.device import device as device_named
 from plenocli.base.errors import UsageError
 from plenocli.evaluation.metrics.quality import PictureScore, score_picture
 from plenocli.evaluation.metrics.spectral import CubeScore, score_cube
@@ -30,6 +31,7 @@ from plenocli.files.read.training import read_training
 from plenocli.forward.accuracy.dial import plan_pif
 from plenocli.forward.camera.model import Camera
 from plenocli.forward.propagation.accuracy_record import AccuracyRecord
+from plenocli.forward.propagation.models import on_device
 from plenocli.forward.propagation.plan import PifPlan
 from plenocli.forward.propagation.system_matrix import SystemMatrix, build_pif
 from plenocli.forward.scene.light import band_weights, broadband, broadened, has_colour
@@ -169,8 +171,11 @@ def system_matrix(
     model: str = "auto",
     dtype: np.typing.DTypeLike = "auto",
     lenslet: tuple[int, int] | None = None,
+    device: str = "cpu",
 ) -> SystemMatrix:
     """The system matrix A of a camera, with the record of its accuracy; arguments as for `plan`.
+
+    device: "cpu" or "cuda", where the products of an exact model are compressed.
 
     Returns A (band, superpixel, pixel, point) and what belongs to it.
     Raises UsageError or NumericsError where the request cannot be met.
@@ -187,7 +192,7 @@ def system_matrix(
         lenslet=lenslet,
     )
     with one_thread():
-        return build_pif(camera, chosen)
+        return build_pif(camera, on_device(chosen, device))
 
 
 def simulate_capture(
@@ -342,6 +347,7 @@ def reconstruct(
     alpha: float | None = None,
     rank: int | None = None,
     lam: float | None = None,
+    device: str = "cpu",
     seed: int = 0,
 ) -> Reconstruction:
     """The picture in front of a camera.
@@ -356,6 +362,7 @@ def reconstruct(
     overlap: superpixels (a side) looked at for each block, 1 or 3; None as the matrix allows.
     noise_sigma: standard deviation of the noise in units of A x; None: as the capture tells.
     alpha, rank, lam: parameter of tikhonov, tsvd and dictionary; None: chosen.
+    device: "cpu" or "cuda", where plug and play works.
     seed: of every random stream.
 
     Returns the picture (row, column) or (band, row, column), its standard deviation where the
@@ -390,6 +397,7 @@ def reconstruct(
         read_pictures,
         None if dictionary is None else lambda: dictionary,
         threads=1,
+        device=device_named(device),
     )
     way = METHODS[method]
     data = superpixels(_capture(capture), system, calibration, each_pixel=way.each_pixel)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -224,3 +225,11 @@ MODELS: tuple[Model, ...] = (
 def model_named(name: str) -> Model:
     """The model that plans and tables call so."""
     return next(model for model in MODELS if model.name == name)
+
+
+def on_device(plan: PifPlan, device: str) -> PifPlan:
+    """The plan with what of it a device can do there; as it is where that is nothing.
+
+    device: as plenocli.base.device names it.
+    """
+    return replace(plan, device=device) if model_named(plan.rung).on_device else plan

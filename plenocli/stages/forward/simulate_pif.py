@@ -256,9 +256,12 @@ def _write(task: _Task, job: _Job, output: Path | str) -> PifSummary:
     from plenocli.files.artefacts import pif_pieces
     from plenocli.files.artefacts.writing import write_artefact
     from plenocli.forward.propagation.diagnosis import describe
+    from plenocli.forward.propagation.models import on_device
     from plenocli.forward.propagation.system_matrix import build_pif
 
-    camera, plan = job.camera, _on_device(job.plan, task.settings.device)
+    camera, plan = job.camera, on_device(job.plan, task.settings.device)
+    if plan.device != task.settings.device:
+        note(f"--device {task.settings.device}: {plan.rung}, is computed on the processor")
     provenance = _provenance(task.camera_path, camera, task.settings, plan, task.command)
 
     def finish(matrix: SystemMatrix, found: Diagnosis) -> Artefact:
@@ -291,16 +294,6 @@ def _write(task: _Task, job: _Job, output: Path | str) -> PifSummary:
     if not chosen.streamed:
         write_artefact(output, finish(matrix, found), overwrite=task.overwrite)
     return summary_of(str(output), matrix, found, plan)
-
-
-def _on_device(plan: PifPlan, device: str) -> PifPlan:
-    """The plan with what of it a device can do there, and a note where that is nothing."""
-    from plenocli.forward.propagation.models import model_named
-
-    if device == "cpu" or model_named(plan.rung).on_device:
-        return replace(plan, device=device)
-    note(f"--device {device}: {plan.rung}, is computed on the processor")
-    return plan
 
 
 def _write_several(

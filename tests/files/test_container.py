@@ -18,7 +18,7 @@ from plenocli.base.errors import InputError, NumericsError
 from plenocli.files.artefacts.container import HEADER_BYTES, MAGIC, Artefact, cfa_text
 from plenocli.files.artefacts.kinds import SCHEMAS
 from plenocli.files.artefacts.provenance import Provenance
-from plenocli.files.artefacts.reading import read_artefact
+from plenocli.files.artefacts.reading import opened_artefact, read_artefact
 from plenocli.files.artefacts.writing import write_artefact
 from tests.faults.harness import mutants
 
@@ -411,3 +411,20 @@ def test_threads_that_read_at_the_same_time_get_their_own_files(tmp_path):
             )
         )
     assert found == [number % 8 for number in range(160)]
+
+
+def test_damage_that_was_not_looked_for_is_told_as_damage(tmp_path):
+    """Bytes all over a file, of which those of values are not looked at."""
+    write_artefact(tmp_path / "a.h5", spectra())
+    good, told = (tmp_path / "a.h5").read_bytes(), 0
+    for at in range(HEADER_BYTES, len(good), 97):
+        damaged = bytearray(good)
+        damaged[at] ^= 64
+        (tmp_path / "b.h5").write_bytes(damaged)
+        try:
+            with opened_artefact(tmp_path / "b.h5", "spectra", (), verify=False):
+                pass
+        except InputError as error:
+            assert "its SHA-256 is not the one it was written with" in str(error)
+            told += 1
+    assert told > 5

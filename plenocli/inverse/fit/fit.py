@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -58,6 +59,11 @@ CLEAR = 4.0
 """Steps over lenslet borders under the mirrored camera, over those under the found one, from which
 on a fit that leaves more than its noise is believed altogether, and less of it before: where both
 fit badly the camera is a third.
+"""
+TOLD, MATTERS = 1.5, 3.0
+"""The same ratio from which on a camera is told from its mirror image (2.2 is the least of 60 right
+fits, 1.2 the wrong one's), and by how many times the noise the light of both must differ for it to
+matter which of them it is.
 """
 INFLATION = 1.8
 """By how much the standard deviations exceed the curvature's: drawn cameras were farther by it."""
@@ -132,10 +138,17 @@ def fit_camera(
         best = _mirrored_along_one_axis(ascent, best, limits[0])
         if not _whole(problem, known):
             best, ascent, problem = mend(best, ascent, problem)
-    turned = None
+    turned, either = None, False
     if best.evidence.noise_factor() <= limits[1]:
-        best, turned = _told_apart(ascent, best, problem.captures)
-    return _described(ascent, best, believed_ratio(limits, turned), begun, turned)
+        best, turned, unlike = _told_apart(ascent, best, problem.captures)
+        either = turned is not None and turned < TOLD and unlike > MATTERS
+    found = _described(ascent, best, believed_ratio(limits, turned), begun, turned)
+    if either and found.accepted:
+        why = "is not told from its mirror image, whose objects are turned by 180 degrees"
+        found = replace(
+            found, accepted=False, why=why, camera=camera, matrix=np.asarray(begun.matrix, float)
+        )
+    return found
 
 
 def _mended(
@@ -241,22 +254,25 @@ def _likely(at: Point) -> float:
 
 def _told_apart(
     ascent: Ascent, at: Point, captures: Sequence[CapturedLenslets]
-) -> tuple[Point, float | None]:
+) -> tuple[Point, float | None, float]:
     """(the one of a camera and its mirror image whose objects go on from lenslet to lenslet, how
-    many times larger the other's steps over the borders are).
+    many times larger the other's steps over the borders are, how unlike both are: the difference of
+    their light over the noise).
     """
     mirrored = ascent.family.mirrored(ascent.values(at.x))
     if mirrored is None:
-        return at, None
+        return at, None, 0.0
     x = (mirrored - ascent.family.start) / ascent.family.tolerance
     other = ascent.point(x, at.factor, finer=ascent.difference(x))
     steps = [_border_steps(p, ascent, captures) for p in (at, other)]
+    difference = np.linalg.norm(other.matrix - at.matrix) / np.linalg.norm(at.matrix)
+    unlike = float(difference) * ascent.evidence.quiet
     if steps[0] is None or steps[1] is None:
-        return at, None
+        return at, None, unlike
     if steps[0] <= steps[1]:
-        return at, steps[1] / steps[0]
+        return at, steps[1] / steps[0], unlike
     other = max([other, *ascent.mirrored(at, other.finer)], key=_likely)
-    return ascent.settle(other, STEPS), steps[0] / steps[1]
+    return ascent.settle(other, STEPS), steps[0] / steps[1], unlike
 
 
 def _border_steps(at: Point, ascent: Ascent, captures: Sequence[CapturedLenslets]) -> float | None:

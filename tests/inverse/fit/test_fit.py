@@ -13,6 +13,7 @@ from plenocli.base.tiling import to_blocks
 from plenocli.files.config.camera_file import parse_camera, to_toml
 from plenocli.forward.camera.geometry import geometry
 from plenocli.forward.propagation.system_matrix import build_pif
+from plenocli.inverse.fit import fit as fit_module
 from plenocli.inverse.fit.captures import tell_rotation
 from plenocli.inverse.fit.fit import accepted_ratios, believed_ratio, fit_camera
 from plenocli.inverse.fit.optics import CameraFamily, all_parameters
@@ -99,6 +100,17 @@ def test_astigmatism_is_not_taken_for_a_defocus(monkeypatch):
     assert fit.accepted, fit.why
     assert np.linalg.norm(fit.matrix - right) < 3 * fit.model_error * np.linalg.norm(right)
     assert np.abs([(p.value - t) / p.sigma for p, t in zip(fit.parameters, truth)]).max() < 4
+
+
+def test_a_camera_that_its_mirror_image_explains_as_well_is_not_accepted(monkeypatch):
+    """Objects that go on from lenslet to lenslet no better than turned ones tell nothing."""
+    monkeypatch.setattr(fit_module, "_border_steps", lambda *_: 1.0)
+    fit = fitted.__wrapped__("all")[1]
+    assert not fit.accepted and "mirror image" in fit.why and fit.turned == 1.0
+    assert fit.camera == CAMERA and fit.noise_ratio < 1.05
+    # where noise hides which of them it is, either will do
+    monkeypatch.setattr(fit_module, "MATTERS", np.inf)
+    assert fitted.__wrapped__("all")[1].accepted
 
 
 def test_the_fitted_camera_is_a_camera_file_like_any_other():

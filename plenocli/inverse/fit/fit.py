@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -142,13 +141,8 @@ def fit_camera(
     if best.evidence.noise_factor() <= limits[1]:
         best, turned, unlike = _told_apart(ascent, best, problem.captures)
         either = turned is not None and turned < TOLD and unlike > MATTERS
-    found = _described(ascent, best, believed_ratio(limits, turned), begun, turned)
-    if either and found.accepted:
-        why = "is not told from its mirror image, whose objects are turned by 180 degrees"
-        found = replace(
-            found, accepted=False, why=why, camera=camera, matrix=np.asarray(begun.matrix, float)
-        )
-    return found
+    limit = believed_ratio(limits, turned)
+    return _described(ascent, best, limit, begun, turned, either=either)
 
 
 def _mended(
@@ -317,9 +311,11 @@ def _uncertainty(ascent: Ascent, at: Point, ratio: float) -> tuple[np.ndarray, n
 
 
 def _described(
-    ascent: Ascent, at: Point, limit: float, begun: Point, turned: float | None
+    ascent: Ascent, at: Point, limit: float, begun: Point, turned: float | None, *, either: bool
 ) -> CameraFit:
-    """The CameraFit of the point where a fit ended; begun: the described camera."""
+    """The CameraFit of the point where a fit ended; begun: the described camera; either: whether
+    it may as well be its mirror image.
+    """
     family, ratio = ascent.family, at.evidence.noise_factor()
     sigma, correlation, error = _uncertainty(ascent, at, ratio)
     values = ascent.values(at.x)
@@ -331,6 +327,9 @@ def _described(
         accepted, why = False, "superpixels would be off by more than half a pixel"
     if accepted and error > 1:
         accepted, why = False, "tells nothing of the matrix under the noise told"
+    if accepted and either:
+        accepted = False
+        why = "is not told from its mirror image, whose objects are turned by 180 degrees"
     camera = family.camera
     if accepted:
         try:

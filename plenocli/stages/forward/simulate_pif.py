@@ -260,8 +260,6 @@ def _write(task: _Task, job: _Job, output: Path | str) -> PifSummary:
     from plenocli.forward.propagation.system_matrix import build_pif
 
     camera, plan = job.camera, on_device(job.plan, task.settings.device)
-    if plan.device != task.settings.device:
-        note(f"--device {task.settings.device}: {plan.rung}, is computed on the processor")
     provenance = _provenance(task.camera_path, camera, task.settings, plan, task.command)
 
     def finish(matrix: SystemMatrix, found: Diagnosis) -> Artefact:
@@ -270,7 +268,7 @@ def _write(task: _Task, job: _Job, output: Path | str) -> PifSummary:
     # the diagnosis too: its singular values must not depend on the cores of a machine
     with one_thread(), within(replace(budget(), threads=task.workers)):
         chosen = pif_pieces.layout(plan, task.camera_path)
-        _announce(camera, plan, pif_pieces.cost(plan)[1], task.announced)
+        _announce(camera, plan, pif_pieces.cost(plan)[1], task)
         with bar(None, total=plan.shape[0] * plan.shape[3], label="columns of A") as shown:
 
             def progress(done: int, total: int) -> None:
@@ -359,17 +357,20 @@ def _request(camera: Camera, settings: Settings, needs: SceneNeeds | None) -> di
     )
 
 
-def _announce(camera: Camera, plan: PifPlan, memory: int, announced: set[str]) -> None:
-    """Tell the warnings of a plan that were not `announced` before, and that the work takes long
-    where it does.
+def _announce(camera: Camera, plan: PifPlan, memory: int, task: _Task) -> None:
+    """Tell the warnings of a plan that this task did not tell before, that it does not take the
+    device where it does not, and that the work takes long where it does.
     """
     from plenocli.forward.accuracy.explain import command_seconds, expectation
 
     beside = command_seconds(camera, plan).beside
-    for line in (*plan.warnings, expectation(plan, memory, beside=beside)):
-        if line and line not in announced:
+    elsewhere, device = "", task.settings.device
+    if plan.device != device:
+        elsewhere = f"--device {device}: {plan.rung}, is computed on the processor"
+    for line in (*plan.warnings, elsewhere, expectation(plan, memory, beside=beside)):
+        if line and line not in task.announced:
             note(line)
-            announced.add(line)
+            task.announced.add(line)
 
 
 def _provenance(

@@ -92,7 +92,7 @@ def test_pixel_energies_are_the_same_elsewhere(other, signed):
     signs = rng.choice([-1, 1], 7) if signed else None
     rows, columns = np.array([4, 0, 1, 2, 4]), np.array([1, 3, 1, 3, 0])
     found = np.empty((5, 4, 6))
-    Factors(high, wide, (4, 6), 3, signs, other).superpixel(1, 0, rows, columns, found)
+    Factors(high, wide, (4, 6), 3, signs, device=other).superpixel(1, 0, rows, columns, found)
     for one, r, c in zip(found, rows, columns):
         field = (high[1, r] * (1 if signs is None else signs)) @ wide[0, c].T
         # nodes of a pixel run slowest
@@ -100,8 +100,13 @@ def test_pixel_energies_are_the_same_elsewhere(other, signed):
         np.testing.assert_allclose(one, parts.sum(axis=(0, 2)), rtol=1e-12)
     if not signed:
         turned = np.empty((5, 6, 4))
-        Factors(high, wide, (4, 6), 3, None, other).turned.superpixel(0, 1, columns, rows, turned)
+        Factors(high, wide, (4, 6), 3, device=other).turned.superpixel(0, 1, columns, rows, turned)
         np.testing.assert_allclose(turned, found.transpose(0, 2, 1), rtol=1e-12)
+        shown = rng.normal(size=(12, 12)), rng.normal(size=(18, 18))
+        after, there = np.empty((5, 4, 6)), np.empty((5, 4, 6))
+        Factors(high, wide, (4, 6), 3, None, shown, other).superpixel(1, 0, rows, columns, after)
+        Factors(shown[0] @ high, shown[1] @ wide, (4, 6), 3).superpixel(1, 0, rows, columns, there)
+        np.testing.assert_allclose(after, there, rtol=1e-12)
 
 
 @pytest.mark.parametrize("bands", [1, 2])

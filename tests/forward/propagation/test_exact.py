@@ -17,6 +17,7 @@ from plenocli.forward.propagation.exact import low_rank_product as product
 from plenocli.forward.propagation.exact import term_counts
 from plenocli.forward.propagation.exact.residual import Residual, ell, kappa, path, split
 from plenocli.forward.propagation.fresnel.paraxial_error import paraxial_error
+from plenocli.forward.propagation.fresnel.separable_fields import Factors
 from plenocli.forward.propagation.system_matrix import PifBuilder
 from tests.forward.propagation.cameras import WAVELENGTH, small_camera
 from tests.reference.fresnel import sensor_nodes
@@ -212,7 +213,10 @@ def test_a_window_of_pixels_off_the_superpixel_s_centre():
     ids=str,
 )
 @pytest.mark.parametrize("f_number", [1.5, 3, 10])
-def test_functions_that_carry_the_field_bring_what_the_pixels_nodes_do(f_number, change):
+def test_functions_that_carry_the_field_bring_what_the_pixels_nodes_do(
+    f_number, change, monkeypatch
+):
+    monkeypatch.setattr(term_counts, "MANY", 10**9)  # the same singular vectors of both
     pitch, pixels = 62e-6, 31
     camera = fast_camera(
         f_number,
@@ -525,6 +529,44 @@ def test_compression_keeps_what_was_asked():
     )
 
 
+@pytest.mark.parametrize("begun", [10, 250, 400])
+@pytest.mark.parametrize("symmetric", [False, True])
+def test_a_spanned_product_keeps_what_was_asked(symmetric, begun):
+    """A sketch that grows, one that serves, and one as large as the product."""
+    left, right, core = _random_product(np.random.default_rng(15), 400, 300, 0.06)
+    right = left if symmetric else right
+    full = left @ core @ right.T
+    cut = 1e-3 * np.linalg.norm(full)
+    high, wide = product.Product([left], [right], {(0, 0): core}, symmetric).spanned(cut, begun)
+    assert np.linalg.norm(high @ wide.T - full) < 1.1 * cut
+    assert np.allclose(high.conj().T @ high, np.eye(high.shape[1]))
+    singular = np.linalg.svd(full, compute_uv=False)
+    least = np.count_nonzero(np.sqrt(np.cumsum(singular[::-1] ** 2))[::-1] > cut)
+    assert least <= high.shape[1] <= 1.35 * least + 2
+
+
+def test_fields_shown_on_nodes_afterwards_are_those_multiplied_there():
+    rng = np.random.default_rng(16)
+    (rows, columns), nodes, lines, terms = (3, 5), 2, (4, 7), 6
+    high, wide = (
+        rng.normal(size=(1, 3, n, terms)) + 1j * rng.normal(size=(1, 3, n, terms)) for n in lines
+    )
+    shown = rng.normal(size=(nodes * rows, lines[0])), rng.normal(size=(nodes * columns, lines[1]))
+    at_once = Factors(shown[0] @ high, shown[1] @ wide, (rows, columns), nodes)
+    after = Factors(high, wide, (rows, columns), nodes, shown=shown)
+    points = np.repeat(np.arange(3), 3), np.tile(np.arange(3), 3)
+    for one, other, shape in (
+        (at_once, after, (rows, columns)),
+        (at_once.turned, after.turned, (columns, rows)),
+    ):
+        found = [np.empty((9, *shape)) for _ in range(2)]
+        one.superpixel(0, 0, *points, found[0])
+        other.superpixel(0, 0, *points, found[1])
+        np.testing.assert_allclose(found[1], found[0], rtol=1e-12)
+    with pytest.raises(ValueError, match="do not fit"):
+        Factors(high, wide, (columns, rows), nodes, shown=shown)
+
+
 @pytest.mark.parametrize("symmetric", [False, True])
 def test_a_product_of_few_terms_is_narrowed_in_single_precision(symmetric):
     rng = np.random.default_rng(7)
@@ -562,6 +604,8 @@ def test_too_many_terms_are_refused(monkeypatch):
     left, right, core = _random_product(np.random.default_rng(6), 90, 60, 0.01)
     with pytest.raises(NumericsError, match="separable terms"):
         product.Product([left], [right], {(0, 0): core}, False).factors(1e-3, 10)
+    with pytest.raises(NumericsError, match="separable terms"):
+        product.Product([left], [right], {(0, 0): core}, False).spanned(1e-3, 10)
 
 
 def test_refusals():

@@ -10,7 +10,8 @@ from plenocli.base.errors import NumericsError
 from plenocli.forward.accuracy.dial import plan_pif
 from plenocli.forward.camera.field import shift_of
 from plenocli.forward.camera.geometry import array_position, chief_ray, corner_ray, lenslet_shift
-from plenocli.forward.propagation.exact import oblique
+from plenocli.forward.propagation.exact import oblique, term_counts
+from plenocli.forward.propagation.fresnel import separable_fields
 from plenocli.forward.propagation.system_matrix import PifBuilder
 from tests.forward.propagation.cameras import WAVELENGTH, small_camera
 from tests.forward.propagation.test_exact import errors, image_points
@@ -110,6 +111,23 @@ def test_what_is_asked_off_the_axis_holds_or_is_refused(f_number, pitch, half, a
     else:
         assert plan.model == "exact" or asked >= 0.1
         assert worst_error(camera, (0, 0), plan) <= min(asked, 1.5 * plan.estimated)
+
+
+@pytest.mark.parametrize("turn", [1.0, 0.6])
+@pytest.mark.parametrize("asked", [1e-2, 1e-3])
+def test_large_superpixels_hold_what_is_asked(asked, turn, monkeypatch):
+    """On the diagonal and off it: fields whose terms are random columns, multiplied on functions of
+    the superpixel, as those of many cells are.
+    """
+    monkeypatch.setattr(term_counts, "MANY", 0)
+    monkeypatch.setattr(separable_fields, "LINES_SERVE", math.inf)
+    camera = wide_camera(4.0, 40e-6, 15.0)
+    end = camera.lenslet_array.count[0] - 1
+    place = end, end // 2 + round(turn * end / 2)
+    plan = exact_plan(camera, place, asked)
+    tables = PifBuilder(camera, WAVELENGTH, plan).lenslets._tables
+    assert tables[0, 0].shown and tables[0, 0].high.shape[2] < tables[0, 0].shown[0].shape[0]
+    assert worst_error(camera, place, plan) <= asked
 
 
 def test_one_matrix_for_all_lenslets_says_how_far_it_is_off_at_the_corner():

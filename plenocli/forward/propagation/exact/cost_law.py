@@ -16,12 +16,14 @@ from plenocli.forward.propagation.exact.term_counts import (
     field_products,
     field_rank,
     fine_rank,
+    is_spanned,
     own_products,
     own_terms,
     require_sketch,
     sketch_size,
     term_law,
 )
+from plenocli.forward.propagation.fresnel.separable_fields import field_operations, lines_serve
 from plenocli.forward.propagation.fresnel.spread_function import psf_nodes
 from plenocli.forward.propagation.sampling import (
     distinct,
@@ -37,6 +39,8 @@ if TYPE_CHECKING:
 
 OBLIQUE_TERMS = 2.0
 """Terms of the main lens's field off the axis over those on it."""
+SPANNED = 1.25
+"""Columns that span a field over its terms by singular vectors."""
 CAUTION = 1.3
 """By how much more terms than expected a field is refused at once rather than after minutes."""
 
@@ -93,6 +97,14 @@ class _Sizes:
         """
         return 1.0 if self.lit == 1 else self.lines / self.nodes
 
+    def spanned(self, kind: _Kind) -> bool:
+        """Whether the columns of a sketch are the terms of such superpixels."""
+        return self.lit == 1 and is_spanned(sketch_size(self.ranks[kind.aside]))
+
+    def kept(self, kind: _Kind) -> float:
+        """Terms of their tables."""
+        return self.ranks[kind.aside] * (SPANNED if self.spanned(kind) else 1.0)
+
     @property
     def tables(self) -> int:
         """Superpixels whose tables are computed."""
@@ -120,7 +132,7 @@ def features(
     sizes = _sizes(camera, geometry, band, superpixels_of(shape[1]), n)
     written, count = math.prod(shape[1:]), columns(camera, geometry, shape)
     fine = math.prod(geometry.pixel_shape) * band.pixel_nodes**2
-    mean = sum(kind.count * sizes.ranks[kind.aside] for kind in sizes.kinds) / sizes.tables
+    mean = sum(kind.count * sizes.kept(kind) for kind in sizes.kinds) / sizes.tables
     # terms that go with the point, too
     terms = band.terms * (OBLIQUE_TERMS if oblique else 1)
     orders = orders_for(geometry, band.cut / 2)
@@ -128,7 +140,7 @@ def features(
     operations = {
         "interval_values": 4 * rows * sizes.across,
         "interval_terms": 8 * rows * terms,
-        "sensor": 8.0 * fine * mean * count,
+        "sensor": _point_operations(geometry, band, sizes, mean) * count,
     }
     wide = item / 8  # what is twice as long takes twice the time
     seconds = {
@@ -151,7 +163,11 @@ def features(
         * (sizes.beside + 1)
         * (sizes.lit * sizes.across * sizes.points)
         * own_terms(geometry, band, band.cut),
-        "factors": item * sizes.tables * sizes.points * sizes.lines * mean,
+        "factors": item
+        * sizes.tables
+        * sizes.points
+        * mean
+        * (sizes.nodes if _modes(band, sizes, mean) else sizes.lines),
         "process": 1.0,
     }
     lenslets = min(1.0, n.lenslets_coarse + n.lenslets_a_decade * sizes.decades)
@@ -248,17 +264,37 @@ def _sizes(
     )
 
 
+def _modes(band: ExactBand, sizes: _Sizes, terms: float) -> bool:
+    """Whether fields of so many terms are multiplied on functions of the superpixel."""
+    square = (sizes.lines, sizes.lines), terms, (sizes.nodes, sizes.nodes)
+    return sizes.lit == 1 and bool(band.sensor_count) and lines_serve(*square)
+
+
+def _point_operations(geometry: Geometry, band: ExactBand, sizes: _Sizes, terms: float) -> float:
+    """Real operations that a point's field takes on the nodes of a superpixel."""
+    v, u = (band.pixel_nodes * pixels for pixels in geometry.pixel_shape)
+    lines = (sizes.nodes, sizes.nodes) if _modes(band, sizes, terms) else None
+    return field_operations((v, u), terms, lines)
+
+
 def _table_operations(kind: _Kind, sizes: _Sizes, band: ExactBand) -> dict[str, float]:
     rank, products = sizes.ranks[kind.aside], sizes.products[kind.aside]
     sketch, rows = sketch_size(rank), kind.count * kind.rows
     joined = rows * sizes.joined
-    # of many lenslets each brings few terms, so that products are narrow and wait for memory
-    return {
-        "sketch_isolated" if sizes.lit == 1 else "sketch_joined": joined * products * sketch,
+    shown = band.sensor_count and not _modes(band, sizes, sizes.kept(kind))
+    parts = {
         "intervals_applied": rows * products * sizes.across,
+        "prolate": rows * sizes.lines * rank if shown else 0.0,
+    }
+    if sizes.spanned(kind):
+        # first on either side of the sketch, then twice on what is kept of it
+        twice = sketch / 2 + sizes.kept(kind)
+        return parts | {"spanned": rows * products * twice, "basis": rows * sketch**2 / 4}
+    # of many lenslets each brings few terms, so that products are narrow and wait for memory
+    return parts | {
+        "sketch_isolated" if sizes.lit == 1 else "sketch_joined": joined * products * sketch,
         "basis": joined * sketch**2,
         "coupling": kind.count * sketch**3,
-        "prolate": rows * sizes.lines * rank if band.sensor_count else 0.0,
     }
 
 

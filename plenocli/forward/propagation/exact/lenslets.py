@@ -28,12 +28,13 @@ from plenocli.forward.propagation.exact.term_counts import (
     ExactBand,
     field_rank,
     field_terms,
+    is_spanned,
     require_sketch,
     sketch_size,
 )
 from plenocli.forward.propagation.exact.trial import exact_trial_columns
 from plenocli.forward.propagation.fresnel.array_to_sensor import lit_lenslets, sensor_nodes
-from plenocli.forward.propagation.fresnel.separable_fields import Factors
+from plenocli.forward.propagation.fresnel.separable_fields import Factors, lines_serve
 from plenocli.forward.propagation.fresnel.spread_function import (
     edge_emphasis,
     psf_nodes,
@@ -390,21 +391,37 @@ class ExactSquareLenslets(LensletFields):
                 couplings[first, first] = coupling
         right = left if symmetric else right
         product = Product(left, right, couplings, symmetric, self.device)
-        high, wide = product.factors(
-            self.band.cut * math.sqrt(count),
-            guess,
-            self._worst(sy, sx),
+        high, wide = (
+            product.spanned(self.band.cut * math.sqrt(count), guess)
+            if alone and is_spanned(guess)
+            else product.factors(self.band.cut * math.sqrt(count), guess, self._worst(sy, sx))
         )
-        if alone:
-            high, wide = pair.on_pixels(high, wide)
+        sides = self._sensor_side(sy, 0, beside), self._sensor_side(sx, 1, beside)
+        shown = None
+        if alone:  # of one lenslet's path no energy tells
+            shown = self._modes_shown(sides, high.shape[1])
+            high, wide = (high, wide) if shown else pair.on_pixels(high, wide)
         products = sum(x.shape[1] for x in left)
         return Factors(
-            self._by_point(high, self._sensor_side(sy, 0, beside))[None],
-            self._by_point(wide, self._sensor_side(sx, 1, beside))[None],
+            self._by_point(high, sides[0])[None],
+            self._by_point(wide, sides[1])[None],
             self.geometry.pixel_shape,
             self.band.pixel_nodes,
+            shown=shown,
             device=self.device,
         ), products
+
+    def _modes_shown(
+        self, sides: tuple[SensorSide, SensorSide], terms: int
+    ) -> tuple[np.ndarray, np.ndarray] | None:
+        """What brings fields of so many terms to the pixels' nodes after they were multiplied; None
+        where it is less work to multiply them there.
+        """
+        y, x = (side.modes for side in sides)
+        if y is None or x is None:
+            return None
+        (v, m), (u, n) = y.shown.shape, x.shown.shape
+        return (y.shown, x.shown) if lines_serve((v, u), terms, (m, n)) else None
 
     def _expected_rank(self, sy: int, sx: int) -> float:
         return field_rank(self.geometry, self.band, self._parabolic, (sy != 0) + (sx != 0))

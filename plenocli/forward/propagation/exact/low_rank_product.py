@@ -31,6 +31,8 @@ NARROW, OVER = 2, 2
 """A product is narrowed where its terms fit a sketch of its factors' over the first; random
 combinations that this is told from, over that.
 """
+TESTED = 16
+"""Random columns, at the least, by which it is told what those before them leave."""
 SMALL = 40
 """Terms of factors that are not worth narrowing."""
 THIN = 1e-13
@@ -157,12 +159,39 @@ class Product:
             ):
                 return high[:, :terms].copy(), wide[:, :terms].copy()
             if size >= MAX_SKETCH:
-                raise NumericsError(
-                    f"the exact field has more than {int(FILL * size)} separable terms",
-                    "model",
-                    "ask for a looser accuracy, fewer superpixels or the paraxial model",
-                )
+                raise _too_many(size)
             size = min(most, max(size + size // 4, int(terms / FILL) + 8))
+
+    def spanned(self, cut: float, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """The product through random combinations of its columns alone, M = H B^T with H
+        orthonormal: some more terms than its own rank in half the work, for what is not used often.
+
+        cut, count: as `factors`.
+
+        Returns (H, B).
+        Raises NumericsError where no sketch of MAX_SKETCH columns holds M.
+        """
+        most, xp = min(self.limit, MAX_SKETCH), self.device.xp
+        size, q = min(count, most), None
+        while True:
+            if size >= self.limit:  # no room beside what is there: anew, as _extend
+                q = None
+            known = 0 if q is None else q.shape[1]
+            columns = self._times(0, self._mixed(1, size - known))
+            for _ in range(2 if known else 0):
+                columns -= q @ (_adjoint(q) @ columns)
+            new, triangle = _triangle(columns)
+            if known:
+                new = xp.concat([q, orthonormal(new - q @ (_adjoint(q) @ new))], axis=1)
+            q, more = new, _explaining(self.device.get(triangle), cut)
+            if more or size >= self.limit:
+                q = q[:, : known + more if more else size]
+                turned = xp.conj(q)
+                seen = self._times(1, [x.T @ turned for x in self.left])
+                return self.device.get(q), self.device.get(seen)
+            if size >= MAX_SKETCH:
+                raise _too_many(size)
+            size = min(most, size + size // 4)
 
     def narrowed(self, cut: float) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
         """The product through far fewer columns than its factors have terms, M = X K Y^T.
@@ -219,6 +248,29 @@ class Product:
         told = xp.take(x, rows, axis=0) @ core @ xp.take(y, columns, axis=0).T
         mean = float(xp.mean(xp.abs(exact - told) ** 2))
         return math.sqrt(mean * x.shape[0] * y.shape[0])
+
+
+def _explaining(triangle: np.ndarray, cut: float) -> int:
+    """How many of the random columns Q R, all but a few, leave no more than `cut` of M, by what
+    they leave of the others; 0 where too many do.
+
+    triangle: R.
+    """
+    count = len(triangle)
+    # R below and right of an entry of the diagonal is what those before it leave of the others,
+    # which together are as long as M
+    left = np.cumsum((np.abs(triangle) ** 2).sum(axis=1)[::-1])[::-1]
+    left *= count / np.arange(count, 0, -1)
+    enough = np.flatnonzero(left[: max(1, count - TESTED)] <= cut**2)
+    return max(1, int(enough[0])) if len(enough) else 0
+
+
+def _too_many(size: int) -> NumericsError:
+    return NumericsError(
+        f"the exact field has more than {int(FILL * size)} separable terms",
+        "model",
+        "ask for a looser accuracy, fewer superpixels or the paraxial model",
+    )
 
 
 def _terms_of_all(high: np.ndarray, wide: np.ndarray, worst: np.ndarray | None) -> int:

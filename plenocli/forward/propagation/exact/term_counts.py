@@ -24,6 +24,9 @@ MANY_CELLS, EDGE_CELLS = 100.0, 50.0
 """Diffraction cells of a lenslet that the effects of fine cuts and of edges are stated for."""
 MARGIN = 1.12
 """How many more terms than expected the first sketch of a field holds."""
+MANY = 200
+"""Columns of a first sketch beyond which singular vectors cost more than the terms that they save.
+"""
 FINE_DECADES = 2.0
 """Decades below the coarsest cut from which on fields with neighbours take more terms."""
 
@@ -102,6 +105,13 @@ def term_law() -> TermLaw:
 def sketch_size(terms: float) -> float:
     """Columns of the random sketch that is begun with where so many terms are expected."""
     return MARGIN / FILL * terms + 8
+
+
+def is_spanned(sketch: float) -> bool:
+    """Whether a product that a sketch of so many columns is begun for keeps its columns as they
+    are, where it stands alone: singular vectors would cost more than the terms that they save.
+    """
+    return sketch > MANY
 
 
 def require_sketch(terms: float) -> None:

@@ -24,6 +24,25 @@ WORK_BYTES = 1 << 22
 right-hand side is packed for several points.
 """
 
+LINES_SERVE = 0.8
+"""Share of the operations that fields multiplied line by line may take: they are moved once more.
+"""
+
+
+def field_operations(
+    nodes: tuple[int, int], terms: float, lines: tuple[int, int] | None = None
+) -> float:
+    """Real operations that the field of one point takes on so many nodes: multiplied there, or on
+    `lines` that are shown on them afterwards.
+    """
+    (v, u), (m, n) = nodes, lines or nodes
+    return 8.0 * m * n * terms + (4.0 * u * m * (n + v) if lines else 0.0)
+
+
+def lines_serve(nodes: tuple[int, int], terms: float, lines: tuple[int, int]) -> bool:
+    """Whether fields are better multiplied on `lines`."""
+    return field_operations(nodes, terms, lines) < LINES_SERVE * field_operations(nodes, terms)
+
 
 class Factors:
     """Pixel energies from factor tables.
@@ -36,6 +55,8 @@ class Factors:
     pixel_shape: (rows, columns);
     pixel_nodes: nodes per axis;
     signs: (terms,) of +-1 that multiply the terms, so that one table may serve as both;
+    shown: real (nodes x pixel rows, lines) and (nodes x pixel columns, lines) that bring fields to
+        the nodes, where the tables have lines in their place; None: they have the nodes;
     device: where tables are multiplied.
     """
 
@@ -46,13 +67,13 @@ class Factors:
         pixel_shape: tuple[int, int],
         pixel_nodes: int,
         signs: np.ndarray | None = None,
+        shown: tuple[np.ndarray, np.ndarray] | None = None,
         device: Device = CPU,
     ) -> None:
-        if (
-            high.shape[2] != pixel_nodes * pixel_shape[0]
-            or wide.shape[2] != pixel_nodes * pixel_shape[1]
-            or high.shape[3] != wide.shape[3]
-        ):
+        nodes = [pixel_nodes * pixels for pixels in pixel_shape]
+        lines = [high.shape[2], wide.shape[2]]
+        whole = [x.shape for x in shown] == [*zip(nodes, lines)] if shown else lines == nodes
+        if not whole or high.shape[3] != wide.shape[3]:
             raise ValueError(
                 f"tables {high.shape} and {wide.shape} do not fit {pixel_nodes} nodes in "
                 f"pixels {pixel_shape}"
@@ -63,13 +84,17 @@ class Factors:
         )
         self.pixel_shape, self.pixel_nodes = (pixel_shape[0], pixel_shape[1]), pixel_nodes
         self.signs = None if signs is None else signs.astype(high.real.dtype)
+        self.shown = shown and (_as(high, shown[0]), _as(high, shown[1].T))
         self.device = device
 
     @cached_property
     def turned(self) -> Factors:
         """Rows and columns exchanged, of tables without signs."""
         shape = self.pixel_shape[1], self.pixel_shape[0]
-        return Factors(self.wide, self.high, shape, self.pixel_nodes, device=self.device)
+        shown = self.shown and (self.shown[1].T, self.shown[0])
+        return Factors(
+            self.wide, self.high, shape, self.pixel_nodes, shown=shown, device=self.device
+        )
 
     @cached_property
     def _there(self) -> tuple[Any, Any]:
@@ -105,7 +130,7 @@ class Factors:
                 together = len(at) == 1 or (np.diff(at) == 1).all()
                 chosen = slice(at[0], at[-1] + 1) if together else at
                 left = self.high[sy, chosen].view(real).reshape(-1, 2 * terms)
-                product = np.matmul(left, right, out=work[: len(left)])
+                product = self._shown(np.matmul(left, right, out=work[: len(left)]))
                 # (point, node, pixel row x (part, node, pixel column)): |U|^2, summed over nodes
                 parts = product.reshape(len(part), nodes, -1)
                 energy = np.einsum("nqk,nqk->nk", parts, parts)
@@ -116,10 +141,22 @@ class Factors:
         xp, put = self.device.xp, self.device.put
         (py, px), nodes, (high, wide) = self.pixel_shape, self.pixel_nodes, self._there
         left = xp.take(high[sy, :, :, :], put(rows), axis=0)
-        energy = xp.abs(left @ wide[sx, int(column), :, :].T) ** 2
+        field = left @ wide[sx, int(column), :, :].T
+        if self.shown:
+            y, x = (xp.astype(put(n), field.dtype) for n in self.shown)
+            field = y @ (field @ x)
+        energy = xp.abs(field) ** 2
         return self.device.get(
             xp.sum(xp.reshape(energy, (len(rows), nodes, py, nodes, px)), axis=(1, 3))
         )
+
+    def _shown(self, product: np.ndarray) -> np.ndarray:
+        """(points x lines, (real, imaginary) x lines) on the nodes."""
+        if not self.shown:
+            return product
+        (y, x), lines = self.shown, self.high.shape[2]
+        wide = product.reshape(-1, x.shape[0]) @ x
+        return y @ wide.reshape(-1, lines, 2 * x.shape[1])
 
     def _right(self, factor: np.ndarray) -> np.ndarray:
         """(node, term) complex as the right-hand side of a real product: (term x (real,
@@ -131,3 +168,8 @@ class Factors:
         right[:, 0, 1] = turned.imag
         np.negative(turned.imag, out=right[:, 1, 0])
         return right.reshape(2 * len(turned), -1)
+
+
+def _as(table: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+    """A real matrix in the precision of a table."""
+    return np.ascontiguousarray(matrix, table.real.dtype)

@@ -36,6 +36,8 @@ answer the question.
 """
 EDGE = 2.0
 """Extra weight of points at a lenslet's edge in what is left out."""
+MOMENTS = 1 << 19
+"""Numbers in a slab of pupil nodes x polynomials."""
 BASIS_POINTS = 1 << 11
 """Positions at which the series are summed together: the basis of a slab stays in the cache."""
 
@@ -179,33 +181,33 @@ def mirrored(y: np.ndarray, x: np.ndarray, weight: np.ndarray, axis: int) -> boo
 
 
 def _row_transforms(rows: Rows, frequency: np.ndarray) -> np.ndarray:
-    """sum_i weight[m, i] exp(-j frequency[n] x[m, i]): (rows, len(frequency)); symmetric rows
-    and frequencies cost a quarter.
+    """sum_i weight[m, i] exp(-j frequency[n] x[m, i]): (rows, len(frequency)). A few nodes across
+    all rows carry the waves, and each row is brought onto these by its Legendre moments; symmetric
+    rows have even ones alone, of half of them.
     """
     if rows.x.strides[0] == 0:  # a grid of nodes: one matrix product
         return rows.weight @ np.exp(-1j * np.outer(rows.x[0], frequency))
-    count, nodes = len(frequency), rows.x.shape[1]
-    paired = count % 2 == 0 and np.allclose(frequency, -frequency[::-1], rtol=1e-14, atol=0)
-    f = frequency[count // 2 :] if paired else frequency
+    low, high = rows.x.min(), rows.x.max()
+    middle, half = (low + high) / 2, max((high - low) / 2, np.finfo(float).tiny)
     even = mirrored(rows.y, rows.x, rows.weight, 1)
-    x, weight = (
-        (rows.x[:, nodes // 2 :], rows.weight[:, nodes // 2 :] * 2)
-        if even
-        else (rows.x, rows.weight)
-    )
-    if even and nodes % 2:
-        weight[:, 0] /= 2
+    # a node in the middle is nobody's mirror image
+    first, twice = rows.x.shape[1] // 2 * even, np.ones(rows.x.shape[1])
+    twice[(rows.x.shape[1] + 1) // 2 :] += even
+    x, weight = (a[:, first:] for a in ((rows.x - middle) / half, rows.weight * twice))
     parts = np.stack([weight.real, weight.imag], -1)
-    c, s = (np.zeros((len(rows.y), len(f)), complex) for _ in range(2))
-    slab = max(1, 500_000 // max(1, f.size * x.shape[1]))
-    for start in range(0, len(rows.y), slab):
-        some = slice(start, start + slab)
-        phase = f[None, :, None] * x[some, None, :]
-        c[some] = (np.cos(phase) @ parts[some]).view(complex)[..., 0]
-        if not even:
-            s[some] = (np.sin(phase) @ parts[some]).view(complex)[..., 0]
-    here = c - 1j * s
-    return np.concatenate([(c + 1j * s)[:, ::-1], here], axis=1) if paired else here
+    bend = half * np.abs(frequency).max()
+    step, count = 1 + int(even), math.ceil(bend + 6 * math.cbrt(bend) + 16)
+    nodes, weights = gauss(count)
+    onto = legendre(nodes, -(-count // step), step)
+    onto *= (step * np.arange(onto.shape[1]) + 0.5) * weights[:, None]
+    moments = np.empty((len(x), onto.shape[1]), complex)
+    slab = max(1, MOMENTS // (x.shape[1] * count))
+    for start in range(0, len(x), slab):
+        some = x[start : start + slab]
+        values = legendre(some.ravel(), onto.shape[1], step).T.reshape(-1, *some.shape)
+        seen = values.transpose(1, 0, 2) @ parts[start : start + slab]
+        moments[start : start + slab] = seen.view(complex)[..., 0]
+    return moments @ onto.T @ np.exp(-1j * np.outer(middle + half * nodes, frequency))
 
 
 def edge_emphasis(geometry: Geometry, points: np.ndarray) -> np.ndarray:

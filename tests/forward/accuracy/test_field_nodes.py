@@ -22,9 +22,11 @@ ACCURACY = 1e-3
 
 
 @lru_cache
-def fifteen_degrees():
-    """(camera, nodes, matrix of a place) of an array whose corner is 15 degrees from the axis."""
-    camera = wide_camera(half=11.0)
+def fifteen_degrees(f_number=8.0, pitch=40e-6, **changes):
+    """(camera, nodes, plans, matrix of a place) of an array whose corner is 15 degrees from the
+    axis.
+    """
+    camera = wide_camera(f_number, pitch, 11.0, **changes)
     plan_at = PlansOfPlaces(
         camera, accuracy=ACCURACY, superpixels=(1, 1), coherent_ring=0, dtype="float64"
     )
@@ -41,6 +43,15 @@ def fifteen_degrees():
     return camera, nodes, plan_at, at
 
 
+def missed(camera, at, place):
+    """Largest relative error of columns of the lenslet at a place, against sums of spherical waves
+    in which nothing is expanded.
+    """
+    found = at(place)[:, POINTS].T.reshape(-1, *camera.sensor.pixels_per_lenslet)
+    truth = oblique_columns(camera, WAVELENGTH, place, image_points(camera, POINTS), pixel_nodes=8)
+    return errors(found, truth).max()
+
+
 def test_few_places_serve_fifteen_degrees():
     camera, nodes, plan_at, _ = fifteen_degrees()
     corner = math.hypot(nodes.rows[-1], nodes.columns[-1]) / camera.lenslet_array.distance
@@ -53,14 +64,30 @@ def test_few_places_serve_fifteen_degrees():
 
 @pytest.mark.parametrize("way", [(1.0, 1.0), (0.9, 0.9), (-0.95, 0.3), (0.4, -0.65)])
 def test_lenslets_between_places_meet_the_oracle(way):
-    """Sums of spherical waves in which nothing is expanded, at the corner and where polynomials err
-    most.
-    """
+    """At the corner and where polynomials err most."""
     camera, nodes, _, at = fifteen_degrees()
-    place = (way[0] * nodes.rows[-1], way[1] * nodes.columns[-1])
-    found = at(place)[:, POINTS].T.reshape(-1, *camera.sensor.pixels_per_lenslet)
-    truth = oblique_columns(camera, WAVELENGTH, place, image_points(camera, POINTS), pixel_nodes=8)
-    assert errors(found, truth).max() < ACCURACY
+    assert missed(camera, at, (way[0] * nodes.rows[-1], way[1] * nodes.columns[-1])) < ACCURACY
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "array",
+    [
+        {},
+        {"f_number": 4.0, "pitch": 24e-6},
+        {"f_number": 6.0, "lenslet_array__aperture_shape": "circle"},
+        {"lenslet_array__aperture_shape": "circle", "lenslet_array__fill_factor": 0.7},
+        {"lenslet_array__aperture_shape": "hexagon", "lenslet_array__fill_factor": 0.86},
+    ],
+    ids=str,
+)
+def test_every_place_and_all_in_the_middle_between_meet_the_oracle(array):
+    """In an octant, edges and corner included."""
+    camera, nodes, _, at = fifteen_degrees(**array)
+    halves = np.sort(np.r_[nodes.rows, (nodes.rows[1:] + nodes.rows[:-1]) / 2])
+    places = [(y, x) for y in halves for x in halves if -1e-12 < y <= x + 1e-12]
+    assert len(places) >= 15
+    assert max(missed(camera, at, place) for place in places) < ACCURACY
 
 
 def test_a_place_s_matrix_is_that_of_its_mirror_image_turned():

@@ -330,10 +330,15 @@ def field_features(camera: Camera, geometry: Geometry, band: BandPlan) -> dict[s
     """
     even = is_symmetric(camera)
     nodes = band.psf_nodes / 2 if even else band.psf_nodes
-    if even and geometry.blur == 0:
+    if has_real_field(camera, geometry):
         return {"field_cubed_real": nodes**3, "field_squared_real": nodes**2}
     found = {"field_cubed_complex": nodes**3, "field_squared_complex": nodes**2}
     return found if even else found | {"pupil_waves": pupil_waves(camera, geometry, band)}
+
+
+def has_real_field(camera: Camera, geometry: Geometry) -> bool:
+    """Whether the spread function is real: of symmetric pupils in focus."""
+    return is_symmetric(camera) and geometry.blur == 0
 
 
 def pupil_waves(camera: Camera, geometry: Geometry, band: BandPlan) -> float:

@@ -31,6 +31,7 @@ from plenocli.forward.propagation.plan import BandPlan
 from plenocli.forward.propagation.sampling import (
     distinct,
     field_features,
+    has_real_field,
     superpixels_of,
 )
 
@@ -161,6 +162,10 @@ class ShapedLenslets(LensletFields):
             for key, products in self._products.items()
         }
 
+    def _stored(self, values: np.ndarray) -> np.ndarray:
+        """Values of terms in the precision of the tables, real where they are."""
+        return values.astype(self.dtype if np.iscomplexobj(values) else self.dtype().real.dtype)
+
     # the two tables of one set of lenslets
 
     def _rows(self, positions: Positions) -> np.ndarray:
@@ -170,7 +175,7 @@ class ShapedLenslets(LensletFields):
         g, axis = self.geometry, self.cut.axis
         at = (self.cut.at[:, :, None] + np.asarray(positions) * g.D2).reshape(len(self.cut.at), -1)
         values = self.field.evaluate(at - g.points(axis)[:, None, None], axis)
-        return np.ascontiguousarray(_folded(values, 2)).astype(self.dtype)
+        return np.ascontiguousarray(self._stored(_folded(values, 2)))
 
     def _across(self, positions: Positions, place: float) -> list[np.ndarray]:
         """Kernels along the chords of lenslets at `positions` to the superpixel at `place`: by
@@ -207,7 +212,7 @@ class ShapedLenslets(LensletFields):
             nodes = np.concatenate(
                 [(x[:, None, :] + shift[:, None]).ravel() for x, _ in self.cut.pieces]
             )
-            values = np.ascontiguousarray(self.field.evaluate(nodes, axis).astype(self.dtype).T)
+            values = np.ascontiguousarray(self._stored(self.field.evaluate(nodes, axis)).T)
             parts, start = [], 0
             for x, _ in self.cut.pieces:
                 stop = start + x.size * len(shift)
@@ -329,7 +334,7 @@ class ShapedLenslets(LensletFields):
         out = np.empty((len(self.cut.at), self.field.terms, across[0].shape[2]), self.dtype)
         start = 0
         for values, kernel in zip(self._along(product[1 - self.cut.axis], index), across):
-            np.matmul(values, kernel, out=out[start : start + len(kernel)])
+            _times(values, kernel, out[start : start + len(kernel)])
             start += len(kernel)
         return _accumulated(out)
 
@@ -344,9 +349,9 @@ class ShapedLenslets(LensletFields):
         for table, terms in zip(tables, spread):
             chosen = table[scan].transpose(1, 0, 2, 3)
             chords, points, nodes, _ = chosen.shape
-            fields = (chosen.reshape(chords, points * nodes, -1) @ terms).reshape(
-                chords, points, 2, nodes // 2, -1
-            )
+            fields = np.empty((chords, points * nodes, terms.shape[2]), self.dtype)
+            _times(chosen.reshape(chords, points * nodes, -1), terms, fields)
+            fields = fields.reshape(chords, points, 2, nodes // 2, -1)
             stop = start + chords * nodes // 2
             out[:, :, start:stop].reshape(points, 2, chords, nodes // 2, -1)[...] = (
                 fields.transpose(1, 2, 0, 3, 4)
@@ -399,6 +404,14 @@ class ShapedLenslets(LensletFields):
 def _whole(part: np.ndarray) -> np.ndarray:
     """The array that holds the numbers of a view."""
     return part if part.base is None else part.base
+
+
+def _times(values: np.ndarray, kernel: np.ndarray, out: np.ndarray) -> None:
+    """out[...] = values @ kernel, for real or complex values and a complex kernel."""
+    if np.iscomplexobj(values):
+        np.matmul(values, kernel, out=out)
+    else:  # real and imaginary parts side by side
+        np.matmul(values, kernel.view(values.dtype), out=out.view(values.dtype))
 
 
 def _accumulated(panels: np.ndarray) -> np.ndarray:
@@ -520,6 +533,7 @@ def features(
     count, terms = count * len(products), band.terms
     places = geometry.lines(grid, 1 - axis) if band.window is not None else superpixels
     wide = item / 8  # what is twice as long takes twice the time
+    parts = 1 if has_real_field(camera, geometry) else 2
     chord_values = lanes * chord * band.psf_nodes
     scan_values = geometry.object_shape[axis] * scan * band.psf_nodes
     heights = geometry.object_shape[axis] * scan * terms
@@ -527,10 +541,10 @@ def features(
     alone = superpixels if band.window is None else 1
     return Features(
         {
-            "chords_to_sensor": 8.0 * lanes * places * chord * terms * across,
-            "scan_lines": 8.0 * points * places * scan * terms * across,
+            "chords_to_sensor": 4.0 * parts * lanes * places * chord * terms * across,
+            "scan_lines": 4.0 * parts * points * places * scan * terms * across,
             "hop": 8.0 * points * scan * across * along * superpixels,
-            "guard": 8.0 * points * scan * terms**2,
+            "guard": 2.0 * parts**2 * points * scan * terms**2,
         },
         {
             "process": 1.0,
@@ -550,7 +564,7 @@ def features(
         },
         (
             {
-                "heights": item * heights * alone,
+                "heights": item / 2 * parts * heights * alone,
                 "spread": item * count * terms * across,
                 "kept": sum(
                     min(KEPT_BYTES, item * values)

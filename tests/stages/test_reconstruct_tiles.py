@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 import time
@@ -12,7 +13,8 @@ import pytest
 from plenocli.base.errors import NumericsError
 from plenocli.cli.main import run
 from plenocli.evaluation.metrics.quality import psnr
-from plenocli.files.artefacts.reading import read_artefact
+from plenocli.files.artefacts.reading import Stored, read_artefact
+from plenocli.files.read import captures
 from plenocli.inverse.picture import tiles
 from plenocli.stages.inverse.reconstruct import in_tiles
 from tests.stages import test_reconstruct
@@ -198,3 +200,27 @@ def test_other_outputs_of_tiles(folder, tmp_path, small_tiles, capsys):
     value = read_artefact(tmp_path / "p.h5", "image").data["image/value"]
     assert value.min() == 0 and 0 < said["negative_share"] < 1
     assert run([*command, str(made / "coupled/capture.h5"), "-o", str(tmp_path / "many")]) in (0, 2)
+
+
+def test_tiles_side_by_side_unpack_their_rows_once(folder, small_tiles, tmp_path, monkeypatch):
+    """The same picture as where nothing may be kept; another capture of that name is read anew."""
+    made, _ = folder
+    read = []
+    monkeypatch.setattr(
+        Stored,
+        "window",
+        lambda self, *part, own=Stored.window: read.append(part) or own(self, *part),
+    )
+    kept = picture(made / "alone", tmp_path / "kept.h5", method="block-mean")
+    known = len(read)
+    monkeypatch.setattr(captures, "KEPT_SHARE", 0)
+    plain = picture(made / "alone", tmp_path / "plain.h5", method="block-mean")
+    assert len(read) - known >= known + 2  # two tiles in each of two rows
+    np.testing.assert_array_equal(kept.data["image/value"], plain.data["image/value"])
+    monkeypatch.undo()
+    shutil.copytree(made / "alone", tmp_path / "alone")
+    first = picture(tmp_path / "alone", tmp_path / "first.h5", method="block-mean")
+    shutil.copy(made / "coupled" / "capture.h5", tmp_path / "alone" / "capture.h5")
+    other = picture(tmp_path / "alone", tmp_path / "other.h5", method="block-mean")
+    np.testing.assert_array_equal(first.data["image/value"], kept.data["image/value"])
+    assert np.abs(other.data["image/value"] - first.data["image/value"]).max() > 0.01

@@ -122,7 +122,10 @@ class StoredCapture:
 
     def window(self, rows: slice, columns: slice) -> Capture:
         """The capture of a part of the sensor. Raises InputError."""
-        values = self.mosaic.window(rows, columns)
+        return self.holding(self.mosaic.window(rows, columns), rows, columns)
+
+    def holding(self, values: np.ndarray, rows: slice, columns: slice) -> Capture:
+        """The capture of a part of the sensor whose values were read. Raises InputError."""
         _require_sound(self.mosaic.path, values)
         first = (part.indices(side)[0] for part, side in zip((rows, columns), self.shape))
         return replace(self.about, mosaic=values, levels=self.about.levels.from_pixel(*first))

@@ -7,10 +7,16 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+import numpy as np
+
+from plenocli.base.budget import budget
 from plenocli.base.errors import InputError
 from plenocli.base.progress import collected_notes
+from plenocli.files.artefacts.provenance import require_file
 from plenocli.files.images.mosaic import StoredCapture, read_capture, stored_capture
 from plenocli.files.read.calibrations import read_calibration
 from plenocli.inverse.calibration.calibration import Calibration
@@ -18,6 +24,11 @@ from plenocli.inverse.picture.lenslet_model import LensletMatrix, Superpixels
 from plenocli.inverse.picture.superpixels import superpixels
 from plenocli.inverse.picture.tiles import EVERY, Area, Source
 
+if TYPE_CHECKING:
+    from plenocli.forward.sensor.capture import Capture
+
+KEPT_SHARE = 1 / 64
+"""Share of the memory that the last rows of a capture may take."""
 SUFFIXES = tuple(
     ".h5 .exr .dng .png .tif .tiff .3fr .arw .cr2 .cr3 .crw .erf .fff .iiq .kdc .mef .mos .mrw "
     ".nef .nrw .orf .pef .raf .raw .rw2 .rwl .srw .x3f .lfp .lfr .czi .nd2".split()
@@ -123,13 +134,38 @@ class _Held:
         return self.data.cut(rows, columns, own)
 
 
+class _Windows:
+    """Windows of a stored capture. Chunks of its file are as wide as the sensor, so that tiles side
+    by side would unpack the same ones: the last rows are kept where they are few.
+    """
+
+    def __init__(self, capture: StoredCapture) -> None:
+        self.capture = capture
+        self._rows: tuple[slice, np.ndarray] | None = None
+
+    def read(self, rows: slice, columns: slice) -> Capture:
+        """That of some pixels. Raises InputError."""
+        mosaic = self.capture.mosaic
+        size = (rows.stop - rows.start) * mosaic.shape[1] * mosaic.dtype.itemsize
+        if size > KEPT_SHARE * budget().memory:
+            return self.capture.window(rows, columns)
+        if self._rows is None or self._rows[0] != rows:
+            self._rows = None  # not two at a time
+            values = mosaic.window(rows)
+            values.flags.writeable = False
+            self._rows = rows, values
+        return self.capture.holding(self._rows[1][:, columns], rows, columns)
+
+
 class _Stored:
     """Superpixels that stay in the file of a capture, tiled as it says."""
 
-    def __init__(self, capture: StoredCapture, system: LensletMatrix) -> None:
-        self.capture, self.system = capture, system
-        shape = system.pixel_shape
-        self.count = (capture.shape[0] // shape[0], capture.shape[1] // shape[1])
+    def __init__(self, windows: _Windows, system: LensletMatrix) -> None:
+        self.windows, self.system = windows, system
+        self.count = (
+            windows.capture.shape[0] // system.pixel_shape[0],
+            windows.capture.shape[1] // system.pixel_shape[1],
+        )
         self._said = False
 
     def cut(self, rows: slice, columns: slice, own: Area = EVERY) -> Superpixels:
@@ -139,7 +175,7 @@ class _Stored:
             slice(part.start * n, part.stop * n)
             for part, n in zip(lenslets, self.system.pixel_shape)
         )
-        part = self.capture.window(*pixels)
+        part = self.windows.read(*pixels)
         # what there is to say of all of it is said once
         with collected_notes() if self._said else nullcontext():
             found = superpixels(part, self.system)
@@ -159,14 +195,33 @@ def superpixel_source(
     """As read_superpixels, but that those of a simulated capture stay in its file until they are
     asked for.
 
-    verify: as of plenocli.files.artefacts.reading.opened_artefact.
+    verify: as of plenocli.files.artefacts.reading.opened_artefact; a file that was verified before
+        is opened once.
     """
     if calibration is None:
-        with stored_capture(path, verify=verify) as stored:
-            if stored is not None and _divides(system.pixel_shape, stored):
-                yield _Stored(stored, system)
-                return
+        windows = _windows(Path(path)) if verify else _known(Path(path), _stamp(path))
+        if windows is not None and _divides(system.pixel_shape, windows.capture):
+            yield _Stored(windows, system)
+            return
     yield _Held(read_superpixels(path, system, calibration, each_pixel=each_pixel))
+
+
+def _windows(path: Path, *, verify: bool = True) -> _Windows | None:
+    """Those of a capture, None where its mosaic does not stay in the file."""
+    with stored_capture(path, verify=verify) as stored:
+        return None if stored is None else _Windows(stored)
+
+
+@lru_cache(maxsize=1)
+def _known(path: Path, stamp: tuple[int, int]) -> _Windows | None:
+    """The same of a file that this run has verified."""
+    return _windows(path, verify=False)
+
+
+def _stamp(path: str | Path) -> tuple[int, int]:
+    """What tells a file from another one of its name. Raises InputError."""
+    size = require_file(path)
+    return size, Path(path).stat().st_mtime_ns
 
 
 def _divides(shape: tuple[int, int], capture: StoredCapture) -> bool:

@@ -6,6 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from plenocli.base.errors import NumericsError
+from plenocli.forward.camera.geometry import geometry
+from plenocli.forward.propagation.exact.open_fields import residual_of
 from plenocli.forward.propagation.system_matrix import build_pif
 from tests.forward.propagation import foreign
 from tests.forward.propagation.cameras import plan_pif, small_camera, system_matrix
@@ -89,6 +92,31 @@ def test_exact_neighbours_that_missed_hold(count):
     between lenslets of 0.27 of their pitch they have less.
     """
     summed([foreign.answer(9103, 695, "exact")], count)
+
+
+@pytest.mark.parametrize("number", [797, 838, 854])
+def test_pupils_without_symmetry_that_missed_hold(number, count):
+    """Missed 1.06 to 1.7 times where the four points that a trial could afford were the corners:
+    the middles of edges have fringes up to 15 times as large.
+    """
+    assert len(summed([foreign.answer(1, number)], count)) == 1
+
+
+@pytest.mark.slow
+def test_harmonics_of_very_dim_points_that_missed_hold(count, without_openings):
+    """Missed 1.2 times: points between hexagons of 0.22 of their pitch."""
+    (case,) = summed([foreign.answer(3, 314, "auto")], count)
+    assert case.rung == "exact, harmonics"
+
+
+def test_ways_that_turn_too_fast_are_refused_before_they_are_computed():
+    """Took minutes and 38 GiB: superpixels twenty times as wide as their lenslets."""
+    camera, _ = foreign.case(3, 55)
+    with pytest.raises(NumericsError, match="cannot be reached"):
+        plan_pif(camera, model="exact", superpixels=(1, 1), coherent_ring=0, accuracy=0.03)
+    view = geometry(camera, camera.light.wavelengths[0])
+    with pytest.raises(NumericsError, match="takes 4590 nodes along an axis, more than"):
+        residual_of(view, (0.0, 0.0), 1e-3)
 
 
 @pytest.mark.slow

@@ -17,10 +17,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from plenocli.base.errors import NumericsError
 from plenocli.forward.camera.quadrature import gauss, nodes_for, opening_weights
 from plenocli.forward.propagation.exact.debye import spherical_field
 from plenocli.forward.propagation.exact.oblique import at_points, oblique_field
-from plenocli.forward.propagation.exact.residual import Residual, path
+from plenocli.forward.propagation.exact.residual import Residual, path, residual_nodes
 from plenocli.forward.propagation.fresnel.spread_function import separable_field
 
 if TYPE_CHECKING:
@@ -33,6 +34,10 @@ Nodes = tuple[np.ndarray, np.ndarray]
 """(positions, m from a superpixel's centre; weights, m)."""
 
 
+MOST_NODES, MANY_NODES = 600, 100
+"""Nodes along an axis of what a kernel's axes have together: beyond the first singular values take
+seconds and functions gigabytes; beyond the second they are not kept for other pairs.
+"""
 NEAREST = 10
 """Wavelengths from lenslets to sensor within which evanescent waves reach it."""
 
@@ -225,12 +230,26 @@ def _reach(geometry: Geometry, axis: int) -> float:
     return pixels * geometry.pixel_pitch / 2
 
 
-@lru_cache(maxsize=512)
 def residual_of(geometry: Geometry, offset: Place, cut: float) -> Residual:
-    """What the kernel's two axes do together, from a lenslet to a superpixel."""
+    """What the kernel's two axes do together, from a lenslet to a superpixel.
+
+    Raises NumericsError where that takes more than MOST_NODES.
+    """
     g = geometry
-    reach = max(_reach(g, 0), _reach(g, 1))
-    return Residual(offset, reach, max(g.lenslet_extent), g.z3, g.k, None, cut)
+    reach, own = max(_reach(g, 0), _reach(g, 1)), max(g.lenslet_extent)
+    nodes = residual_nodes(offset, reach + own, g.z3, g.k)
+    if nodes > MOST_NODES:
+        raise NumericsError(
+            f"what both axes of the way from a lenslet to its pixels have together takes {nodes} "
+            f"nodes along an axis, more than {MOST_NODES}",
+            "sensor",
+            "take fewer pixels of a lenslet, or the paraxial model",
+        )
+    keep = _kept_residual if nodes <= MANY_NODES else _large_residual
+    return keep(offset, reach, own, g.z3, g.k, None, cut)
+
+
+_kept_residual, _large_residual = (lru_cache(maxsize=n)(Residual) for n in (512, 2))
 
 
 @lru_cache(maxsize=4096)

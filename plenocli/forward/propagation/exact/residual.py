@@ -18,6 +18,8 @@ import numpy as np
 from plenocli.forward.camera.quadrature import gauss
 from plenocli.forward.propagation.fresnel.spread_function import legendre, terms_within
 
+SLAB = 1 << 22
+"""Numbers in a slab of displacements x polynomials."""
 AxisFunctions = Callable[[np.ndarray], np.ndarray]
 """Values (place, term) at places (m, or shares of a half width) along one axis."""
 
@@ -139,7 +141,7 @@ class Residual:
     ) -> None:
         self.centre, self.reach_u, self.reach_x = centre, reach_u, reach_x
         reach = reach_u + reach_x
-        slopes = [_slope(a, b, reach, z, k) for a, b in (centre, centre[::-1])]
+        slopes = _slopes(centre, reach, z, k)
         # nodes weigh alike, which favours the edges of the lenslet, where a point's
         # column is most sensitive
         t, s = (gauss(_nodes(slope))[0] for slope in slopes)
@@ -164,11 +166,15 @@ class Residual:
                 products, roots = products * 2, roots * 2
                 break
             gu, gx = self._grids[axis]
-            d = (reach_u * gu[:, None] - reach_x * gx) / reach
-            values = legendre(d.ravel(), len(nodes), 1) @ (
-                _series(nodes) @ (basis * np.sqrt(len(nodes)))
-            )
-            values = values.reshape(len(gu), len(gx), 1, -1) * lens(gx)[:, :, None]
+            series = _series(nodes) @ (basis * np.sqrt(len(nodes)))
+            values = np.empty((len(gu), len(gx), 1, series.shape[1]), series.dtype)
+            slab = max(1, SLAB // (len(gx) * len(nodes)))
+            for start in range(0, len(gu), slab):
+                d = (reach_u * gu[start : start + slab, None] - reach_x * gx) / reach
+                values[start : start + slab, :, 0] = (
+                    legendre(d.ravel(), len(nodes), 1) @ series
+                ).reshape(*d.shape, -1)
+            values = values * lens(gx)[:, :, None]
             q, r = np.linalg.qr(values.reshape(len(gu) * len(gx), -1) / np.sqrt(len(gu) * len(gx)))
             products.append(q)
             roots.append(r)
@@ -247,6 +253,19 @@ def _lens_terms(
         return lambda grid: legendre(grid, len(t), 1) @ coefficients
 
     return functions(series[0]), core, functions(series[1]), slope
+
+
+def residual_nodes(centre: tuple[float, float], reach: float, z: float, k: float) -> int:
+    """Nodes along an axis of the matrix whose terms a Residual has.
+
+    centre, z, k: as of Residual;
+    reach: half widths of superpixel and lenslet together, m.
+    """
+    return max(map(_nodes, _slopes(centre, reach, z, k)))
+
+
+def _slopes(centre: tuple[float, float], reach: float, z: float, k: float) -> list[float]:
+    return [_slope(own, other, reach, z, k) for own, other in (centre, centre[::-1])]
 
 
 def _slope(own: float, other: float, reach: float, z: float, k: float) -> float:

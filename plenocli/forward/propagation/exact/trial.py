@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from plenocli.base.errors import NumericsError
 from plenocli.forward.propagation.exact.open_fields import OpenFields, offset_of, residual_of
 from plenocli.forward.propagation.fresnel.trial_columns import (
     VALUES,
@@ -35,7 +36,11 @@ class ExactTrial(Trial):
     def cost(self) -> float:
         """As of Trial: each term of the kernel is twice as much as the paraxial model."""
         own = offset_of(self.geometry, (0, 0), (0, 0))
-        return 2 * super().cost * len(residual_of(self.geometry, own, CUTS[1]).core)
+        try:
+            terms = len(residual_of(self.geometry, own, CUTS[1]).core)
+        except NumericsError:
+            return math.inf
+        return 2 * super().cost * terms
 
     def fields(
         self, camera: Camera, points: list[tuple[int, int]]

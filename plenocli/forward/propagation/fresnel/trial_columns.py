@@ -13,7 +13,7 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import product
+from itertools import product, zip_longest
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -32,6 +32,8 @@ if TYPE_CHECKING:
     from plenocli.forward.camera.geometry import Geometry
     from plenocli.forward.camera.model import Camera
 
+Point = tuple[int, int]
+"""(row, column) of the object."""
 CHEAP, AFFORDED = 3e8, 6e8
 """Complex multiplications that a trial may take, and one of few points."""
 NEAR = 2
@@ -163,7 +165,8 @@ def _tried(
     lenslets = [None] if window is None else range(window, 0, -1)
     for near, beside, lines in product(lenslets, (1, 0), (None, *THINNED)):
         trial = kind(geometry, grid, near, symmetric, beside, lines)
-        points = trial.points[: max(int(CHEAP / trial.cost), min(int(AFFORDED / trial.cost), FEW))]
+        least = min(int(AFFORDED / trial.cost), trial.least)
+        points = trial.points[: max(int(CHEAP / trial.cost), least)]
         if points and trial.values <= VALUES:
             light, fringes, within = trial.columns(hashed.camera, points)
             whole = len(points) == len(trial.points) and trial.whole
@@ -175,6 +178,28 @@ def _lines(count: int, symmetric: bool) -> list[int]:
     """Lines of points that are tried, of so many."""
     last = (count - 1) // 2 if symmetric else count - 1
     return np.unique(np.linspace(0, last, LINES).round().astype(int)).tolist()
+
+
+def _points(tried: list[list[int]], shape: tuple[int, int], symmetric: bool) -> list[Point]:
+    """Points on some lines along both axes in the order in which they are tried: of a pupil without
+    symmetry a corner, the middles of two edges, the next corner and so on; then corners, middles of
+    edges and the middle, and the farthest from it first.
+    """
+    marks = [(line[0], line[len(line) // 2], line[-1]) for line in tried]
+    order = sorted(
+        product(tried[0], tried[1]),
+        key=lambda p: (
+            not all(i in some for i, some in zip(p, marks)),
+            -sum(abs(2 * i / (n - 1 or 1) - 1) for i, n in zip(p, shape)),
+        ),
+    )
+    if symmetric:
+        return order
+    (top, middle, bottom), (left, centre, right) = marks
+    corners: list[Point | None] = list(product((top, bottom), (left, right)))
+    edges = [(top, centre), (bottom, centre)], [(middle, left), (middle, right)]
+    first = (p for kinds in zip_longest(corners, *edges) for p in kinds if p)
+    return list(dict.fromkeys([*first, *order]))
 
 
 def _pixel_lines(geometry: Geometry, count: int, most: int | None) -> tuple[list[int], float]:
@@ -229,16 +254,10 @@ class Trial:
         self.whole = lines is None and all(
             (n + symmetric) // (1 + symmetric) <= LINES for n in g.object_shape
         )
-        # corners, middles of edges and the middle, then the farthest from it first
+        # a pupil without symmetry has no two points alike
+        self.least = FEW if symmetric else 2 * FEW
         tried = [_lines(n, symmetric) for n in g.object_shape]
-        marked = [{line[0], line[len(line) // 2], line[-1]} for line in tried]
-        self.points: list[tuple[int, int]] = sorted(
-            product(tried[0], tried[1]),
-            key=lambda p: (
-                not all(i in some for i, some in zip(p, marked)),
-                -sum(abs(2 * i / (n - 1 or 1) - 1) for i, n in zip(p, g.object_shape)),
-            ),
-        )
+        self.points = _points(tried, g.object_shape, symmetric)
 
     @property
     def _lenslets(self) -> list[tuple[int, int]]:

@@ -34,7 +34,9 @@ SHARE = 0.6
 FEWEST_RADII = 24
 """Radii to a superpixel's corner: where it has no fringe light changes with the distance."""
 DIMMEST = 4.0
-"""Most by which interpolation weighs more in a dim point's column."""
+"""Most by which interpolation weighs more in a dim point's column, of 1/16 of the brightest one's
+amplitude; of less the root of how much less it has.
+"""
 MOST_NODES = 40
 """Most nodes per axis of a pixel."""
 
@@ -95,7 +97,7 @@ def harmonic_band(
     # measured: 0.25 to 2.4 times tap_error; a blurred point lights a patch of the superpixel, and a
     # dim one has the finest fringes alone
     effect = max(0.3, min(2.5, 0.8 / own)) * (1.5 if g.blur > g.D2 else 1.0)
-    effect *= min(1 / root, DIMMEST)
+    effect *= min(1 / root, max(DIMMEST, math.sqrt(1 / root)))
 
     def missed(count: int) -> float:
         if tried is not None:

@@ -81,6 +81,9 @@ def test_a_product_is_compressed_elsewhere(other, symmetric):
         assert np.linalg.norm(high @ wide.T - full) < 1.5 * cut
         x, y, core = one.narrowed(cut)
         assert np.linalg.norm(x @ core @ y.T - full) < 2.5 * cut and x.shape[1] < 90
+        high, wide = one.spanned(cut, 60)
+        assert isinstance(wide, np.ndarray) and high.shape[1] <= 1.35 * rank + 2
+        assert np.linalg.norm(high @ wide.T - full) < 1.5 * cut
 
 
 @pytest.mark.parametrize("signed", [False, True])

@@ -57,21 +57,27 @@ def exact(camera, points, lenslets, superpixels, *, window=None, extra=1.0):
         for lenslet in [place] if lenslets is None else lenslets:
             y, x = (a + c for a, c in zip(rule.opening(lenslet), rule.centre(lenslet)))
             fields = rule.behind(points, lenslet).reshape(len(points), -1).T
-            across = (u[0][:, None, None] - x) ** 2
-            step = max(1, BLOCK // (across.size * len(y)))
-            for start in range(0, len(v[0]), step):
-                some = slice(start, start + step)
-                path = (v[0][some, None, None, None] - y[:, None]) ** 2 + across[:, :, :]
-                squares = path + rule.z3**2
-                r = np.sqrt(squares)
-                # R - z3 without cancellation
-                turns = path / (r + rule.z3) / rule.wavelength
-                kernel = (
-                    rule.z3 / squares * (1 + 1j / (rule.k * r)) * np.exp(2j * np.pi * (turns % 1))
-                )
-                total[:, some] += (kernel.reshape(-1, len(fields)) @ fields).T.reshape(
-                    len(points), -1, len(u[0])
-                )
+            beside = max(1, BLOCK // (len(x) * len(y)))
+            for first in range(0, len(u[0]), beside):
+                ours = slice(first, first + beside)
+                across = (u[0][ours, None, None] - x) ** 2
+                step = max(1, BLOCK // (across.size * len(y)))
+                for start in range(0, len(v[0]), step):
+                    some = slice(start, start + step)
+                    path = (v[0][some, None, None, None] - y[:, None]) ** 2 + across[:, :, :]
+                    squares = path + rule.z3**2
+                    r = np.sqrt(squares)
+                    # R - z3 without cancellation
+                    turns = path / (r + rule.z3) / rule.wavelength
+                    kernel = (
+                        rule.z3
+                        / squares
+                        * (1 + 1j / (rule.k * r))
+                        * np.exp(2j * np.pi * (turns % 1))
+                    )
+                    total[:, some, ours] += (kernel.reshape(-1, len(fields)) @ fields).T.reshape(
+                        len(points), -1, len(across)
+                    )
         found.append(rule.pixels(total / rule.wavelength, v, u))
     return np.stack(found, axis=1)
 

@@ -266,8 +266,9 @@ def _sizes(
 
 def _modes(band: ExactBand, sizes: _Sizes, terms: float) -> bool:
     """Whether fields of so many terms are multiplied on functions of the superpixel."""
-    square = (sizes.lines, sizes.lines), terms, (sizes.nodes, sizes.nodes)
-    return sizes.lit == 1 and bool(band.sensor_count) and lines_serve(*square)
+    if sizes.lit > 1 or not band.sensor_count:
+        return False
+    return lines_serve((sizes.lines, sizes.lines), terms, (sizes.nodes, sizes.nodes))
 
 
 def _point_operations(geometry: Geometry, band: ExactBand, sizes: _Sizes, terms: float) -> float:

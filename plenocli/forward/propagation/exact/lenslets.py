@@ -400,7 +400,8 @@ class ExactSquareLenslets(LensletFields):
         shown = None
         if alone:  # of one lenslet's path no energy tells
             shown = self._modes_shown(sides, high.shape[1])
-            high, wide = (high, wide) if shown else pair.on_pixels(high, wide)
+            if not shown:
+                high, wide = pair.on_pixels(high, wide)
         products = sum(x.shape[1] for x in left)
         return Factors(
             self._by_point(high, sides[0])[None],

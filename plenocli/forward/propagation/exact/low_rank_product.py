@@ -116,11 +116,7 @@ class Product:
             q = orthonormal(self._times(0, self._mixed(1, count)))
             return q, self._through_basis(q)
         xp, columns = self.device.xp, self._times(0, self._mixed(1, count - q.shape[1]))
-        for _ in range(2):
-            columns -= q @ (_adjoint(q) @ columns)
-        new = orthonormal(columns)
-        # what was numerically nothing is no direction of its own
-        new = orthonormal(new - q @ (_adjoint(q) @ new))
+        new, _ = _beside_basis(q, columns)
         added = [xp.concat(pair, axis=1) for pair in zip(seen, self._through_basis(new))]
         return xp.concat([q, new], axis=1), added
 
@@ -178,12 +174,9 @@ class Product:
                 q = None
             known = 0 if q is None else q.shape[1]
             columns = self._times(0, self._mixed(1, size - known))
-            for _ in range(2 if known else 0):
-                columns -= q @ (_adjoint(q) @ columns)
-            new, triangle = _triangle(columns)
-            if known:
-                new = xp.concat([q, orthonormal(new - q @ (_adjoint(q) @ new))], axis=1)
-            q, more = new, _explaining(self.device.get(triangle), cut)
+            new, triangle = _triangle(columns) if q is None else _beside_basis(q, columns)
+            q = new if q is None else xp.concat([q, new], axis=1)
+            more = _explaining(self.device.get(triangle), cut)
             if more or size >= self.limit:
                 q = q[:, : known + more if more else size]
                 turned = xp.conj(q)
@@ -342,6 +335,15 @@ def _like(array: Any, values: np.ndarray) -> Any:
 
 def _adjoint(matrix: Any) -> Any:
     return namespace(matrix).conj(matrix).T
+
+
+def _beside_basis(q: Any, columns: Any) -> tuple[Any, Any]:
+    """(an orthonormal basis of what an orthonormal q leaves of columns, R of what it leaves)."""
+    for _ in range(2):
+        columns = columns - q @ (_adjoint(q) @ columns)
+    new, triangle = _triangle(columns)
+    # what was numerically nothing is no direction of its own
+    return orthonormal(new - q @ (_adjoint(q) @ new)), triangle
 
 
 def orthonormal(columns: Any) -> Any:

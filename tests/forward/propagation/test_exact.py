@@ -16,6 +16,7 @@ from plenocli.forward.propagation.exact import lenslets as exact
 from plenocli.forward.propagation.exact import low_rank_product as product
 from plenocli.forward.propagation.exact import term_counts
 from plenocli.forward.propagation.exact.residual import Residual, ell, kappa, path, split
+from plenocli.forward.propagation.fresnel import separable_fields
 from plenocli.forward.propagation.fresnel.paraxial_error import paraxial_error
 from plenocli.forward.propagation.fresnel.separable_fields import Factors
 from plenocli.forward.propagation.system_matrix import PifBuilder
@@ -531,8 +532,13 @@ def test_compression_keeps_what_was_asked():
 
 @pytest.mark.parametrize("begun", [10, 250, 400])
 @pytest.mark.parametrize("symmetric", [False, True])
-def test_a_spanned_product_keeps_what_was_asked(symmetric, begun):
-    """A sketch that grows, one that serves, and one as large as the product."""
+@pytest.mark.parametrize("three", [1, 10_000])
+def test_a_spanned_product_keeps_what_was_asked(symmetric, begun, three, monkeypatch):
+    """A sketch that grows, one that serves, and one as large as the product; by three real
+    products, a part of the rows at a time, and by complex ones.
+    """
+    monkeypatch.setattr(product, "THREE_SERVE", three)
+    monkeypatch.setattr(product, "ROWS", 150)
     left, right, core = _random_product(np.random.default_rng(15), 400, 300, 0.06)
     right = left if symmetric else right
     full = left @ core @ right.T
@@ -543,6 +549,27 @@ def test_a_spanned_product_keeps_what_was_asked(symmetric, begun):
     singular = np.linalg.svd(full, compute_uv=False)
     least = np.count_nonzero(np.sqrt(np.cumsum(singular[::-1] ** 2))[::-1] > cut)
     assert least <= high.shape[1] <= 1.35 * least + 2
+
+
+@pytest.mark.parametrize("signed", [False, True])
+def test_fields_of_many_terms_are_sums_of_products(signed):
+    """Three real products in single precision against the sum itself."""
+    rng = np.random.default_rng(17)
+    (rows, columns), nodes, points, terms = (3, 5), 2, 4, separable_fields.THREE_SERVE
+    high, wide = (
+        rng.normal(size=(1, points, nodes * n, terms))
+        + 1j * rng.normal(size=(1, points, nodes * n, terms))
+        for n in (rows, columns)
+    )
+    signs = rng.choice([-1.0, 1.0], terms) if signed else None
+    at = np.array([3, 0, 1, 2, 2]), np.array([1, 0, 1, 3, 1])
+    found = np.empty((5, rows, columns), np.float32)
+    few = [x.astype(np.complex64) for x in (high, wide)]
+    Factors(*few, (rows, columns), nodes, signs).superpixel(0, 0, *at, found)
+    other = wide if signs is None else wide * signs
+    field = np.einsum("pvj,puj->pvu", high[0, at[0]], other[0, at[1]])
+    energy = (np.abs(field) ** 2).reshape(5, nodes, rows, nodes, columns).sum(axis=(1, 3))
+    np.testing.assert_allclose(found, energy, rtol=1e-5)
 
 
 def test_fields_shown_on_nodes_afterwards_are_those_multiplied_there():

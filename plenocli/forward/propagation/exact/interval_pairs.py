@@ -24,7 +24,11 @@ from plenocli.forward.camera.quadrature import gauss, nodes_for
 from plenocli.forward.propagation.exact.low_rank_product import thin
 from plenocli.forward.propagation.exact.oblique import at_points, orders_of
 from plenocli.forward.propagation.exact.residual import ObliqueWave, Residual, path, split
-from plenocli.forward.propagation.fresnel.spread_function import legendre, terms_within
+from plenocli.forward.propagation.fresnel.spread_function import (
+    legendre,
+    legendre_sum,
+    terms_within,
+)
 
 if TYPE_CHECKING:
     from plenocli.forward.camera.geometry import Geometry
@@ -121,8 +125,9 @@ class Interval:
             tolerance,
         )
         values = self.terms.evaluate(self.place[:, None] - side.points, side.points)
-        values = values * side.emphasis[:, None]
-        self.values = values.astype(dtype if np.iscomplexobj(values) else dtype.type().real.dtype)
+        values = (values * side.emphasis[:, None]).transpose(0, 2, 1)  # (x, term, point)
+        kind = dtype if np.iscomplexobj(values) else dtype.type().real.dtype
+        self.values = np.ascontiguousarray(values, kind)
 
     def _slope(self, middle: float, half: float) -> float:
         """Largest slope (rad/m) of the integrand's phase: of the way to either end of the
@@ -204,11 +209,14 @@ class Interval:
         """Overlaps, for a mean point, of what each term alone brings to the superpixel through
         the separable part: (term, term).
         """
-        sheet = _times(
-            self.side.carry(self.wave(self.across).astype(self.dtype)),
-            self.values.reshape(len(self.x), -1),
-        ).reshape(-1, self.values.shape[2])
-        gram = (sheet.conj().T @ sheet).astype(complex) / len(self.side.points)
+        terms, points = self.values.shape[1:]
+        sheet = np.empty((self.side.lines, terms, points), self.dtype)
+        wave = self.side.carry(self.wave(self.across).astype(self.dtype))
+        _multiply(wave, self.values, out=sheet)
+        gram = np.zeros((terms, terms), complex)
+        for line in sheet:
+            gram += line.conj() @ line.T
+        gram /= points
         return gram if np.iscomplexobj(self.values) else gram.real
 
     @cached_property
@@ -231,21 +239,20 @@ class Interval:
         mixing: (i', i), terms i of the field in those of this interval;
         kept: (r, i) of the pairs that are wanted.
 
-        Returns (lines of the sensor x points, pair).
+        Returns (lines of the sensor, pair, points).
         """
         wave, (kept_r, kept_i) = self.wave(other), kept
-        values = (self.values.reshape(-1, len(mixing)) @ mixing.astype(self.values.dtype)).reshape(
-            *self.values.shape[:2], -1
-        )
-        out = np.empty((self.side.lines, len(self.side.points), len(kept_r)), self.dtype)
+        values = mixing.T.astype(self.values.dtype) @ self.values
+        out = np.empty((self.side.lines, len(kept_r), values.shape[2]), self.dtype)
         for r, term in enumerate(functions(self.side.u, self.x)):
             some = np.flatnonzero(kept_r == r)
             if len(some):
-                flat = values[:, :, kept_i[some]].reshape(len(self.x), -1)
-                out[:, :, some[0] : some[-1] + 1] = _times(
-                    self.side.carry((wave * term).astype(self.dtype)), flat
-                ).reshape(len(out), -1, len(some))
-        return out.reshape(len(out) * out.shape[1], -1)
+                terms = kept_i[some]
+                # strong ones come first: most often all up to the weakest, which need no copy
+                few = values[:, : len(terms)] if terms[-1] < len(terms) else values[:, terms]
+                side = self.side.carry((wave * term).astype(self.dtype))
+                _multiply(side, few, out=out[:, some[0] : some[-1] + 1])
+        return out
 
 
 class Pair:
@@ -261,11 +268,14 @@ class Pair:
         self._field = (field + field.T) / 2 if symmetric else field
         self.weight = float(np.linalg.norm(row.weigh @ self._field @ column.weigh.T))
 
-    def factors(self, reach: float, tolerance: float) -> tuple[np.ndarray, np.ndarray, Matrix]:
+    def factors(
+        self, reach: float, tolerance: float, weak: float
+    ) -> tuple[np.ndarray, np.ndarray, Matrix]:
         """The field on the superpixel as a product X K X'^T.
 
         reach: half width (m) of the superpixel;
-        tolerance: root energy of a mean point's field that may be lost, about.
+        tolerance: root energy of a mean point's field that may be lost, about;
+        weak: as much again, of pairs of terms once it is seen what each brings.
 
         Returns (X, X', K); X' is X where the pair is symmetric.
         """
@@ -305,9 +315,9 @@ class Pair:
         # separable part does not
         brings = [_energy(x) / len(self.row.side.points)]
         brings += brings if self.symmetric else [_energy(y) / len(self.column.side.points)]
-        (some,) = _strong(brings[0] * _weighed(coupling, brings[1]), tolerance / 2)
-        x, coupling = x[:, some], coupling[some][:, some]
-        return x, x if self.symmetric else y[:, some], coupling
+        (some,) = _strong(brings[0] * _weighed(coupling, brings[1]), weak)
+        left, coupling = _by_row(x, some), coupling[some][:, some]
+        return left, left if self.symmetric else _by_row(y, some), coupling
 
     def on_pixels(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Columns for the rows' and for the columns' sensor sides, on the nodes of the pixels."""
@@ -371,13 +381,25 @@ def _norms(interval: Interval, mixing: np.ndarray) -> np.ndarray:
     return (np.abs(interval.weigh @ mixing) ** 2).sum(axis=0)
 
 
-def _energy(columns: np.ndarray) -> np.ndarray:
-    """Sum of squares of each column of a complex matrix: (columns,)."""
-    total = np.zeros(2 * columns.shape[1])
-    for start in range(0, len(columns), ROWS_AT_ONCE):
-        parts = columns[start : start + ROWS_AT_ONCE].view(columns.real.dtype)
-        total += np.einsum("ij,ij->j", parts, parts)
-    return total.reshape(-1, 2).sum(axis=1)
+def _energy(sheet: np.ndarray) -> np.ndarray:
+    """Sum of squares of each pair of a sheet (line, pair, point): (pair,)."""
+    total = np.zeros(sheet.shape[1])
+    step = max(1, ROWS_AT_ONCE // sheet.shape[2])
+    for start in range(0, len(sheet), step):
+        parts = sheet[start : start + step].view(sheet.real.dtype)
+        total += np.einsum("uip,uip->i", parts, parts)
+    return total
+
+
+def _by_row(sheet: np.ndarray, some: np.ndarray) -> np.ndarray:
+    """Some pairs of a sheet (line, pair, point), as (line x point, pair) in its own memory: fresh
+    pages of so large an array take longer than what is moved.
+    """
+    lines, _, points = sheet.shape
+    flat, step = sheet.reshape(-1), points * len(some)
+    for line in range(lines):
+        flat[line * step : (line + 1) * step] = sheet[line, some].T.ravel()
+    return flat[: lines * step].reshape(-1, len(some))
 
 
 def _strong(power: np.ndarray, tolerance: float) -> tuple[np.ndarray, ...]:
@@ -415,7 +437,8 @@ class LocalTerms:
         self._mixing = [basis.conj().T @ v for v in values]
         degrees = np.arange(count)
         project = legendre(t, count, 1).T * w * ((2 * degrees + 1) / 2)[:, None]
-        self._series = np.hstack([project @ (part / root) for part in np.split(basis, orders)])
+        series = np.hstack([project @ (part / root) for part in np.split(basis, orders)])
+        self._series = series.astype(field.rows.dtype)
 
     def coefficients(self, axis: int) -> np.ndarray:
         """(i, term): the terms of h along `axis` in this basis."""
@@ -423,9 +446,8 @@ class LocalTerms:
 
     def evaluate(self, d: np.ndarray, points: np.ndarray) -> np.ndarray:
         """e_i at d (m) from `points` (m, broadcasting): d.shape + (i,), the same for both axes."""
-        t = (np.asarray(d, float).ravel() - self.middle) / self.half
-        values = (legendre(t, len(self._series), 1) @ self._series).reshape(*np.shape(d), -1)
-        return at_points(self.field, values, points)
+        t = (np.asarray(d, float) - self.middle) / self.half
+        return at_points(self.field, legendre_sum(t, self._series), points)
 
 
 def _stacked(values: np.ndarray, orders: int) -> np.ndarray:
@@ -446,10 +468,12 @@ def field_norms(field: SeparableField, axis: int) -> np.ndarray:
     return np.sqrt(power.reshape(orders_of(field), -1).sum(axis=0))
 
 
-def _times(kernel: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """kernel @ values for a complex kernel and real or complex values of the same precision."""
+def _multiply(kernel: np.ndarray, values: np.ndarray, out: np.ndarray) -> None:
+    """out (line, term, point) = kernel (line, x) complex @ values (x, term, point) of the same
+    precision, real or complex, by slices of rows that lie together.
+    """
+    flat, target = (a.reshape(len(a), -1) for a in (values, out))
     if np.iscomplexobj(values):
-        return kernel @ values
-    out = np.empty((len(kernel), values.shape[1]), kernel.dtype)
-    out.real, out.imag = np.vsplit(np.concatenate([kernel.real, kernel.imag]) @ values, 2)
-    return out
+        np.matmul(kernel, flat, out=target)
+    else:
+        target.real, target.imag = np.vsplit(np.concatenate([kernel.real, kernel.imag]) @ flat, 2)

@@ -372,10 +372,13 @@ class ExactSquareLenslets(LensletFields):
         couplings: dict[tuple[int, int], Matrix] = {}
         count = len(self._points(sy, 0)) * len(self._points(sx, 1))
         alone = len(kept) == 1
+        spanned = alone and is_spanned(guess)
         for m, n in kept:
             pair, first = pairs[m, n], len(left)
             tolerance = cut / 2 if (m, n) == kept[-1] else cut / 2 / math.sqrt(len(kept))
-            x, y, coupling = pair.factors(max(self._extent), tolerance)
+            # what is left out of many terms that meet no others adds by energy
+            weak = cut if spanned else tolerance / 2
+            x, y, coupling = pair.factors(max(self._extent), tolerance, weak)
             if (m, n) != kept[-1]:  # its own rank may be far lower
                 one = Product([x], [y], {(0, 0): coupling}, pair.symmetric, self.device)
                 x, y, coupling = one.narrowed(tolerance / 2 * math.sqrt(count)) or (x, y, coupling)
@@ -393,7 +396,7 @@ class ExactSquareLenslets(LensletFields):
         product = Product(left, right, couplings, symmetric, self.device)
         high, wide = (
             product.spanned(self.band.cut * math.sqrt(count), guess)
-            if alone and is_spanned(guess)
+            if spanned
             else product.factors(self.band.cut * math.sqrt(count), guess, self._worst(sy, sx))
         )
         sides = self._sensor_side(sy, 0, beside), self._sensor_side(sx, 1, beside)

@@ -129,7 +129,9 @@ def oblique_field(
     rows, columns = (
         np.einsum(
             "dy,on,nyj->doj", project / root, onto, factor.reshape(orders, count, -1), optimize=True
-        ).reshape(count, -1)
+        )
+        .reshape(count, -1)
+        .astype(fields.dtype)
         for factor in factors
     )
     return ObliqueField(

@@ -44,6 +44,10 @@ def lines_serve(nodes: tuple[int, int], terms: float, lines: tuple[int, int]) ->
     return field_operations(nodes, terms, lines) < LINES_SERVE * field_operations(nodes, terms)
 
 
+THREE_SERVE = 300
+"""Terms from which on three real products take less time than the four of a complex one."""
+
+
 class Factors:
     """Pixel energies from factor tables.
 
@@ -112,7 +116,7 @@ class Factors:
         out: (point, pixel row, pixel column), filled.
         """
         real = self.high.real.dtype
-        lines, terms = self.high.shape[2:]
+        lines = self.high.shape[2]
         (py, px), nodes = self.pixel_shape, self.pixel_nodes
         step = max(1, round(WORK_BYTES / (lines * 2 * self.wide.shape[2] * real.itemsize)))
         work = np.empty((step * lines, 2 * self.wide.shape[2]), real)
@@ -129,8 +133,7 @@ class Factors:
                 # neighbours in order lie together: no copy
                 together = len(at) == 1 or (np.diff(at) == 1).all()
                 chosen = slice(at[0], at[-1] + 1) if together else at
-                left = self.high[sy, chosen].view(real).reshape(-1, 2 * terms)
-                product = self._shown(np.matmul(left, right, out=work[: len(left)]))
+                product = self._shown(self._product(sy, chosen, right, work[: len(at) * lines]))
                 # (point, node, pixel row x (part, node, pixel column)): |U|^2, summed over nodes
                 parts = product.reshape(len(part), nodes, -1)
                 energy = np.einsum("nqk,nqk->nk", parts, parts)
@@ -158,16 +161,44 @@ class Factors:
         wide = product.reshape(-1, x.shape[0]) @ x
         return y @ wide.reshape(-1, lines, 2 * x.shape[1])
 
-    def _right(self, factor: np.ndarray) -> np.ndarray:
-        """(node, term) complex as the right-hand side of a real product: (term x (real,
-        imaginary), (real, imaginary) x node).
+    @cached_property
+    def _thirds(self) -> tuple[np.ndarray, ...] | None:
+        """Real and imaginary parts of `high` and their sum, where these three serve."""
+        if self.high.shape[3] < THREE_SERVE:
+            return None
+        real, imaginary = self.high.real.copy(), self.high.imag.copy()
+        return real, imaginary, real + imaginary
+
+    def _product(
+        self, sy: int, chosen: slice | np.ndarray, right: tuple[np.ndarray, ...], out: np.ndarray
+    ) -> np.ndarray:
+        """Fields of chosen rows of points, (points x lines, (real, imaginary) x lines), into out.
+
+        right: as `_right`.
+        """
+        if self._thirds is None:
+            left = self.high[sy, chosen].view(self.high.real.dtype)
+            return np.matmul(left.reshape(len(out), -1), right[0], out=out)
+        lefts = (part[sy, chosen].reshape(len(out), -1) for part in self._thirds)
+        first, second, both = (left @ part for left, part in zip(lefts, right))
+        width = first.shape[1]
+        np.subtract(first, second, out=out[:, :width])
+        both -= first
+        np.subtract(both, second, out=out[:, width:])
+        return out
+
+    def _right(self, factor: np.ndarray) -> tuple[np.ndarray, ...]:
+        """(node, term) complex as the right-hand side of one real product, (term x (real,
+        imaginary), (real, imaginary) x node), or as those of three, (term, node).
         """
         turned = factor.T if self.signs is None else factor.T * self.signs[:, None]
+        if self._thirds is not None:
+            return turned.real.copy(), turned.imag.copy(), turned.real + turned.imag
         right = np.empty((len(turned), 2, 2, turned.shape[1]), factor.real.dtype)
         right[:, 0, 0] = right[:, 1, 1] = turned.real
         right[:, 0, 1] = turned.imag
         np.negative(turned.imag, out=right[:, 1, 0])
-        return right.reshape(2 * len(turned), -1)
+        return (right.reshape(2 * len(turned), -1),)
 
 
 def _as(table: np.ndarray, matrix: np.ndarray) -> np.ndarray:

@@ -72,18 +72,10 @@ class SeparableField:
         d: positions, m, of any shape;
         axis: 0 for a_j, 1 for b_j.
 
-        Returns (*d.shape, term), complex128, or float64 where h is real.
+        Returns (*d.shape, term), complex, or real where h is, in the precision of the coefficients.
         """
-        d = np.asarray(d, float)
-        coefficients = np.ascontiguousarray(self.columns if axis else self.rows)
-        t, parts = d.ravel() / self.half, coefficients.view(float)
-        out = np.empty((len(t), parts.shape[1]))
-        for start in range(0, len(t), BASIS_POINTS):
-            part = slice(start, start + BASIS_POINTS)
-            np.matmul(
-                legendre(t[part], len(coefficients), 2 if self.even else 1), parts, out=out[part]
-            )
-        return out.view(coefficients.dtype).reshape(*d.shape, -1)
+        coefficients = self.columns if axis else self.rows
+        return legendre_sum(np.asarray(d, float) / self.half, coefficients, 2 if self.even else 1)
 
 
 def legendre(t: np.ndarray, count: int, step: int) -> np.ndarray:
@@ -105,6 +97,24 @@ def legendre(t: np.ndarray, count: int, step: int) -> np.ndarray:
         previous += scaled
         previous, current = current, previous
     return out.T
+
+
+def legendre_sum(t: np.ndarray, coefficients: np.ndarray, step: int = 1) -> np.ndarray:
+    """Sums of Legendre polynomials of degrees 0, step, 2 step, ...
+
+    t: places in [-1, 1], of any shape;
+    coefficients: (degree, sum), real or complex, in whose precision sums are made.
+
+    Returns (*t.shape, sum), of the type of the coefficients.
+    """
+    coefficients = np.ascontiguousarray(coefficients)
+    places, parts = t.ravel(), coefficients.view(coefficients.real.dtype)
+    out = np.empty((len(places), parts.shape[1]), parts.dtype)
+    for start in range(0, len(places), BASIS_POINTS):
+        part = slice(start, start + BASIS_POINTS)
+        basis = legendre(places[part], len(coefficients), step).astype(parts.dtype, copy=False)
+        np.matmul(basis, parts, out=out[part])
+    return out.view(coefficients.dtype).reshape(*t.shape, -1)
 
 
 def carried(fine: int, few: int) -> np.ndarray:

@@ -351,12 +351,12 @@ class ExactSquareLenslets(LensletFields):
 
     # products of two axes
 
-    def _compressed(self, sy: int, sx: int) -> tuple[Factors, int]:
-        """Factors of superpixel (sy, sx), and the pairs of terms that they are compressed from."""
-        symmetric, beside = self._turn and sy == sx, bool(sy and sx)
-        weights = [self._counts(s, axis, beside) for s, axis in ((sy, 0), (sx, 1))]
-        mean = math.prod(math.sqrt(np.mean(weight**2)) for weight in weights)
-        cut = self.band.cut * mean**CONCENTRATION
+    def _bright(self, sy: int, sx: int, least: float) -> dict[tuple[int, int], Pair]:
+        """Lenslets' pairs to superpixel (sy, sx), the brightest last, but for dim ones.
+
+        least: root energy that these may have together.
+        """
+        symmetric = self._turn and sy == sx
         pairs = {
             (m, n): Pair(*self._meet(sy, sx, m, n), symmetric and m == n == sy)
             for m, n in self._lit_by(sy, sx)
@@ -365,21 +365,30 @@ class ExactSquareLenslets(LensletFields):
         total = np.cumsum(
             [pairs[m, n].weight ** 2 * (2 if symmetric and m != n else 1) for m, n in order]
         )
-        kept = [key for key, power in zip(order, total) if power > (cut / 4) ** 2] or order[-1:]
+        kept = [key for key, power in zip(order, total) if power > least**2] or order[-1:]
+        return {key: pairs[key] for key in kept}
+
+    def _compressed(self, sy: int, sx: int) -> tuple[Factors, int]:
+        """Factors of superpixel (sy, sx), and the pairs of terms that they are compressed from."""
+        symmetric, beside = self._turn and sy == sx, bool(sy and sx)
+        weights = [self._counts(s, axis, beside) for s, axis in ((sy, 0), (sx, 1))]
+        mean = math.prod(math.sqrt(np.mean(weight**2)) for weight in weights)
+        cut = self.band.cut * mean**CONCENTRATION
+        kept = self._bright(sy, sx, cut / 4)
         guess = int(sketch_size(self._expected_rank(sy, sx)))
         left: list[np.ndarray] = []
         right: list[np.ndarray] = []
         couplings: dict[tuple[int, int], Matrix] = {}
         count = len(self._points(sy, 0)) * len(self._points(sx, 1))
-        alone = len(kept) == 1
+        alone, brightest = len(kept) == 1, list(kept.values())[-1]
         spanned = alone and is_spanned(guess)
-        for m, n in kept:
-            pair, first = pairs[m, n], len(left)
-            tolerance = cut / 2 if (m, n) == kept[-1] else cut / 2 / math.sqrt(len(kept))
+        for (m, n), pair in kept.items():
+            first, last = len(left), pair is brightest
+            tolerance = cut / 2 if last else cut / 2 / math.sqrt(len(kept))
             # what is left out of many terms that meet no others adds by energy
             weak = cut if spanned else tolerance / 2
             x, y, coupling = pair.factors(max(self._extent), tolerance, weak)
-            if (m, n) != kept[-1]:  # its own rank may be far lower
+            if not last:  # its own rank may be far lower
                 one = Product([x], [y], {(0, 0): coupling}, pair.symmetric, self.device)
                 x, y, coupling = one.narrowed(tolerance / 2 * math.sqrt(count)) or (x, y, coupling)
             if not alone:  # lenslets interfere on the pixels
@@ -404,7 +413,7 @@ class ExactSquareLenslets(LensletFields):
         if alone:  # of one lenslet's path no energy tells
             shown = self._modes_shown(sides, high.shape[1])
             if not shown:
-                high, wide = pair.on_pixels(high, wide)
+                high, wide = brightest.on_pixels(high, wide)
         products = sum(x.shape[1] for x in left)
         return Factors(
             self._by_point(high, sides[0])[None],

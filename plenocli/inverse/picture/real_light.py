@@ -356,26 +356,6 @@ def noise_of_parts(
     return Noise(gain=_photon_transfer(np.concatenate(shares)), read_variance=least)
 
 
-def transfer_noise(
-    cut: np.ndarray,
-    white: np.ndarray,
-    usable: np.ndarray,
-    shape: tuple[int, int],
-    apart: int = 1,
-) -> float:
-    """Photon transfer of one capture: the variance of mixed second differences of pixels, which
-    what lenslets show has little of, against their level.
-
-    cut, white: (lenslet_row, lenslet_column, pixel).
-    usable: like cut.
-    shape: (rows, columns) of a superpixel, px.
-    apart: pixels from one to the next of the same colour.
-
-    Returns the variance for one unit of signal.
-    """
-    return _photon_transfer(_unlike_neighbours(cut, white, usable, shape, apart))
-
-
 def _unlike_neighbours(
     cut: np.ndarray,
     white: np.ndarray,
@@ -383,8 +363,12 @@ def _unlike_neighbours(
     shape: tuple[int, int],
     apart: int,
 ) -> np.ndarray:
-    """(n,) mixed second differences over the root of the level, one of each bright pixel whose
-    neighbours are so; arguments as of transfer_noise.
+    """(n,) mixed second differences, which what lenslets show has little of, over the root of the
+    level, one of each bright pixel whose neighbours are so.
+
+    cut, white, usable: (lenslet_row, lenslet_column, pixel).
+    shape: (rows, columns) of a superpixel, px.
+    apart: pixels from one to the next of the same colour.
     """
     peak = np.nanmax(np.where(usable, white, 0.0), axis=2, keepdims=True)
     bright = np.where(usable & (white > BRIGHT * peak), cut, np.nan).reshape(-1, *shape)

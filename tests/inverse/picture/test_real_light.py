@@ -4,6 +4,7 @@ by formula; and a public capture of two printed sheets.
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,8 +20,8 @@ from plenocli.inverse.picture.lenslet_model import LensletMatrix
 from plenocli.inverse.picture.methods.registry import METHODS
 from plenocli.inverse.picture.real_light import (
     along_the_grid,
+    noise_of_parts,
     sampled,
-    transfer_noise,
     typical_white,
 )
 from plenocli.inverse.picture.superpixels import superpixels
@@ -155,8 +156,15 @@ def test_the_noise_is_that_of_the_photons():
     white = np.full((6, 6, 400), 200.0)
     level = np.repeat(rng.uniform(20, 200, (6, 6, 1)), 400, axis=2)
     cut = 0.02 * rng.poisson(level / 0.02)
-    found = transfer_noise(cut, white, np.ones(white.shape, bool), (20, 20))
-    assert found == pytest.approx(0.02, rel=0.06)
+    calibration = SimpleNamespace(
+        windows=SimpleNamespace(shape=(20, 20)), sensor=SimpleNamespace(read_variance=0.0)
+    )
+    parts = [
+        (cut[rows], white[rows], np.ones(white[rows].shape, bool))
+        for rows in (slice(3), slice(3, 6))
+    ]
+    found = noise_of_parts(SimpleNamespace(cfa="mono"), calibration, parts)
+    assert found.gain == pytest.approx(0.02, rel=0.06)
 
 
 def test_a_real_capture_is_predicted_where_it_was_left_out(shared_data, tmp_path, monkeypatch):

@@ -375,12 +375,12 @@ class ExactSquareLenslets(LensletFields):
         mean = math.prod(math.sqrt(np.mean(weight**2)) for weight in weights)
         cut = self.band.cut * mean**CONCENTRATION
         kept = self._bright(sy, sx, cut / 4)
-        guess = int(sketch_size(self._expected_rank(sy, sx)))
         left: list[np.ndarray] = []
         right: list[np.ndarray] = []
         couplings: dict[tuple[int, int], Matrix] = {}
         count = len(self._points(sy, 0)) * len(self._points(sx, 1))
         alone, brightest = len(kept) == 1, list(kept.values())[-1]
+        guess = int(sketch_size(self._expected_rank(sy, sx), joined=not alone))
         spanned = alone and is_spanned(guess)
         for (m, n), pair in kept.items():
             first, last = len(left), pair is brightest

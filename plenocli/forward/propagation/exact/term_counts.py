@@ -22,8 +22,10 @@ if TYPE_CHECKING:
 
 MANY_CELLS, EDGE_CELLS = 100.0, 50.0
 """Diffraction cells of a lenslet that the effects of fine cuts and of edges are stated for."""
-MARGIN = 1.12
-"""How many more terms than expected the first sketch of a field holds."""
+MARGIN, MARGIN_JOINED = 1.12, 0.78
+"""How many more terms than expected the first sketch of a field holds: of an isolated lenslet's,
+and of many lenslets', whose terms are half of what is expected as often as all of it.
+"""
 MANY = 200
 """Columns of a first sketch beyond which singular vectors cost more than the terms that they save.
 """
@@ -102,9 +104,12 @@ def term_law() -> TermLaw:
     return TermLaw(**law("exact, low rank").counts)
 
 
-def sketch_size(terms: float) -> float:
-    """Columns of the random sketch that is begun with where so many terms are expected."""
-    return MARGIN / FILL * terms + 8
+def sketch_size(terms: float, *, joined: bool = False) -> float:
+    """Columns of the random sketch that is begun with where so many terms are expected.
+
+    joined: whether of many lenslets.
+    """
+    return (MARGIN_JOINED if joined else MARGIN) / FILL * terms + 8
 
 
 def is_spanned(sketch: float) -> bool:

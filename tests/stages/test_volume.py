@@ -19,6 +19,7 @@ from plenocli.files import scratch
 from plenocli.files.artefacts import reading
 from plenocli.files.artefacts.reading import read_artefact
 from plenocli.files.artefacts.writing import write_artefact
+from plenocli.files.bench import Bench
 from plenocli.files.images.mosaic import read_capture
 from plenocli.files.images.tiff_stack import read_tiff_volume, write_volume_tiff
 from plenocli.files.results.stacks import read_stack
@@ -350,6 +351,62 @@ def test_a_volume_whose_parts_stay_in_files_is_that_of_all_in_memory(
         np.testing.assert_allclose(parts.data[name], values, rtol=1e-4, atol=1e-5 * values.max())
     stack = read_tiff_volume(made("v.ome.tif"))
     assert np.array_equal(stack.value, parts.data["volume/value"])
+
+
+@pytest.mark.parametrize("method", ["auto", "rl", "tv"])
+def test_a_volume_that_was_stopped_goes_on_from_its_windows(seen, tmp_path, method, monkeypatch):
+    """The bytes of a run that was not stopped, with no window made twice; other settings, and a
+    window that is damaged, begin anew.
+    """
+    monkeypatch.setattr(Tiles, "_several", lambda self, count: (3, 2))
+    solved, looked_at = [], Tiles.problem
+    put, left = Bench.put, [4]
+
+    def stopped(self, number, arrays):
+        put(self, number, arrays)
+        left[0] -= 1
+        if not left[0]:
+            raise KeyboardInterrupt
+
+    def counted(self, window):
+        solved.append(window)
+        return looked_at(self, window)
+
+    monkeypatch.setattr(Tiles, "problem", counted)
+
+    def run(name="v.h5", seed=0):
+        solved.clear()
+        run_volume(
+            seen / "capture.h5",
+            tmp_path / name,
+            seen / "stack.h5",
+            method=method,
+            background=0.0,
+            seed=seed,
+        )
+        return (tmp_path / name).read_bytes()
+
+    whole = run()
+    assert len(solved) == 6 and [path.name for path in tmp_path.iterdir()] == ["v.h5"]
+    (tmp_path / "v.h5").unlink()
+    with monkeypatch.context() as patch:
+        patch.setattr(Bench, "put", stopped)
+        with pytest.raises(KeyboardInterrupt):
+            run()
+    (folder,) = tmp_path.iterdir()
+    parts = sorted(folder.iterdir())
+    assert len(parts) == 4
+    parts[0].write_bytes(parts[0].read_bytes()[:-9])
+    assert run() == whole and len(solved) == 3
+    assert [path.name for path in tmp_path.iterdir()] == ["v.h5"]
+    (tmp_path / "v.h5").unlink()
+    left[0] = 4
+    with monkeypatch.context() as patch:
+        patch.setattr(Bench, "put", stopped)
+        with pytest.raises(KeyboardInterrupt):
+            run()
+    run(seed=1)
+    assert len(solved) == 6 and [path.name for path in tmp_path.iterdir()] == ["v.h5"]
 
 
 def test_an_ome_tiff_without_room_is_refused_before_the_work(seen, tmp_path, monkeypatch):

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +35,14 @@ HELD_BYTES = 12
 """Memory for a pixel that was put aside, while windows are worked on."""
 Room = Callable[[tuple[int, ...]], Any]
 """What gives room for values of a shape, zero at first, which are put and looked at by slices."""
+
+Keep = Callable[[int, Callable[[], Volume]], Volume]
+"""What gives the volume of the window of a number: as an earlier run left it, or as it is made."""
+
+
+def made(number: int, make: Callable[[], Volume]) -> Volume:
+    """A Keep that keeps nothing."""
+    return make()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,6 +74,7 @@ class Tiles:
     device: of their map.
     like: (plane, row, column) before all lenslets, as volume_of takes it; may stay in a file.
     room: for the volume, plane by plane, that windows are joined to.
+    keep: of the volumes of several windows; may be set later.
 
     Windows overlap by the lenslets that a voxel's light reaches, and fade into each other there.
     All have the same size, and so the same map.
@@ -89,6 +98,7 @@ class Tiles:
         self.device, self.like, self.room = device, like, room
         self.stack, self.measurement, self.method = stack, measurement, method
         self._hold_out, self._seed, self._where = hold_out, seed, where
+        self.keep: Keep = made
         count = measurement.signal.shape[:2]
         self.windows = _windows(count, self._several(count), _halo(stack))
 
@@ -173,11 +183,16 @@ class Tiles:
             found = volume_of(self.problem(only), self.method, self._like(only))
             del self._op
             return found
-        first = volume_of(self.problem(self.brightest), self.method, self._like(self.brightest))
+        brightest, like = self.brightest, self._like(self.brightest)
+        best = next(n for n, window in enumerate(self.windows) if window is brightest)
+        first = self.keep(best, lambda: volume_of(self.problem(brightest), self.method, like))
         again, joined = as_before(first), _Joined(self, bars=first.sigma is not None)
+
+        def make(window: Window) -> Volume:
+            return again(self.problem(window), self._like(window))
+
         for number, window in enumerate(bar(self.windows, len(self.windows), "windows")):
-            own = window is self.brightest
-            part = first if own else again(self.problem(window), self._like(window))
+            part = first if number == best else self.keep(number, partial(make, window))
             joined.add(number, part)
         del self._op  # its memory is that of all pixels that were put aside
         return joined.volume()

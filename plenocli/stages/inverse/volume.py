@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -14,6 +15,7 @@ from plenocli.base.units import format_length
 
 if TYPE_CHECKING:
     from plenocli.files.artefacts.provenance import Provenance
+    from plenocli.files.bench import Bench
     from plenocli.files.results.volumes import StoredVolume
     from plenocli.files.scratch import Scratch
     from plenocli.forward.volume.stack import Stack
@@ -155,15 +157,16 @@ def run_volume(
     _plan(output, tiles)
     if background == "auto":
         _take_haze(tiles)
+    files, settings = describe_inputs(inputs), (hold_out, background, most_planes, channel, seed)
+    bench = _bench(output, tiles, (*settings, there.name, files))
     volume = tiles.volume()
     volume = replace(volume, trace=(*trials, *volume.trace))
     provenance = Provenance(
-        command=command,
-        inputs=describe_inputs(inputs),
-        seed=seed,
-        accuracy=stack.accuracy.as_json(),
+        command=command, inputs=files, seed=seed, accuracy=stack.accuracy.as_json()
     )
     _write(output, volume, stack, provenance, overwrite, there.name)
+    if bench is not None:
+        bench.remove()
     summary = _summary(output, volume, stack)
     if other is not None and summary.explained_db is not None:
         _tell_of_the_clearer(summary.explained_db, other, str(like))
@@ -263,6 +266,23 @@ def _plan(output: Path, tiles: Tiles) -> None:
         output,
         "take an .h5, whose planes stay in a file, or fewer planes",
     )
+
+
+def _bench(output: Path, tiles: Tiles, depends: Any) -> Bench | None:
+    """Where the volumes of several windows are kept until the result is written, which then comes
+    from there; None of one.
+
+    depends: all that they depend on, beside the windows.
+    """
+    from plenocli.files.bench import Bench
+    from plenocli.stages.inverse.kept_windows import kept_part
+
+    if len(tiles.windows) == 1:
+        return None
+    places = [(w.rows, w.columns) for w in tiles.windows]
+    bench = Bench.beside(output, (depends, tiles.method, places))
+    tiles.keep = partial(kept_part, bench)
+    return bench
 
 
 def _take_haze(tiles: Tiles) -> None:

@@ -14,6 +14,7 @@ from plenocli.base.errors import PlenoError
 from plenocli.base.progress import bar, collected_notes, note
 from plenocli.execution.pool import Pool, run_all
 from plenocli.files.artefacts.provenance import file_digest
+from plenocli.files.bench import Bench
 from plenocli.files.read.captures import superpixel_source
 from plenocli.inverse.picture.estimate import estimate
 from plenocli.inverse.picture.estimators import Estimators
@@ -34,7 +35,7 @@ from plenocli.inverse.picture.tiles import (
 from plenocli.stages.inverse.reconstruct.fitted_matrix import likely_cause
 from plenocli.stages.inverse.reconstruct.recipe import Recipe, estimators_of, finer_of
 from plenocli.stages.inverse.reconstruct.solved import Solved
-from plenocli.stages.inverse.reconstruct.tiles import Bench, SolvedTile, picture, solve_all
+from plenocli.stages.inverse.reconstruct.tiles import SolvedTile, picture, solve_all
 
 if TYPE_CHECKING:
     from plenocli.forward.accuracy.limiting_error import Limits

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from plenocli.files.bench import Bench
 from plenocli.inverse.picture.diagnosis import Seen
 from plenocli.inverse.picture.reconstruction import Account, Reconstruction
-from plenocli.stages.inverse.reconstruct.tiles import Bench
 
 if TYPE_CHECKING:
     from plenocli.forward.accuracy.limiting_error import Limits

@@ -4,21 +4,16 @@ run that was killed goes on from them.
 
 from __future__ import annotations
 
-import hashlib
-import shutil
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from plenocli import __version__
 from plenocli.base.errors import OutputError, PlenoError
 from plenocli.base.progress import bar
 from plenocli.base.tiling import InParts, bands, to_plane
 from plenocli.execution.pool import Pool, run_all
-from plenocli.files.kept import read_arrays, write_arrays
+from plenocli.files.bench import Bench
 from plenocli.inverse.picture.reconstruction import Entry, Stats
 from plenocli.inverse.picture.tiles import Tile, counts
 
@@ -36,52 +31,6 @@ class SolvedTile:
     sigma: np.ndarray | None
     trace: tuple[Entry, ...]
     stats: Stats | None
-
-
-@dataclass(frozen=True)
-class Bench:
-    """A folder of finished tiles, which lies beside the result and has a name of all that they
-    depend on.
-    """
-
-    folder: Path
-
-    @classmethod
-    def beside(cls, target: Path, depends: Any) -> Bench:
-        """That of the result `target`; those of other runs towards it go.
-
-        depends: all that tiles depend on, beside the code; its repr counts.
-
-        Raises OutputError where it cannot be made.
-        """
-        digest = hashlib.sha256(f"{__version__} {depends!r}".encode()).hexdigest()[:16]
-        folder = target.with_name(f".{target.name}.{digest}.tiles")
-        for other in target.parent.glob(f".{target.name}.*.tiles"):
-            if other != folder:
-                shutil.rmtree(other, ignore_errors=True)
-        try:
-            folder.mkdir(exist_ok=True)
-        except OSError as error:
-            raise OutputError(
-                f"the folder of its tiles cannot be made ({error.strerror})", target
-            ) from error
-        return cls(folder)
-
-    def path(self, number: int) -> Path:
-        """Of a tile's file."""
-        return self.folder / f"{number:06d}"
-
-    def has(self, number: int) -> bool:
-        """Whether a tile is finished."""
-        return read_arrays(self.path(number)) is not None
-
-    def put(self, number: int, arrays: Sequence[np.ndarray]) -> None:
-        """Keep a finished tile."""
-        write_arrays(self.path(number), tuple(np.ascontiguousarray(a, float) for a in arrays))
-
-    def remove(self) -> None:
-        """Its tiles are no longer needed."""
-        shutil.rmtree(self.folder, ignore_errors=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,7 +63,7 @@ class PlaneOfTiles:
                     yield np.concatenate([plane[part] for plane in planes], axis=1)
 
     def _read(self, number: int) -> np.ndarray:
-        arrays = read_arrays(self.bench.path(number))
+        arrays = self.bench.get(number)
         if arrays is None:
             raise OutputError("a finished tile is gone or damaged", self.bench.folder, "run again")
         return arrays[self.which]
@@ -135,7 +84,7 @@ def solve_all(
     Returns what the method tells of one of them, None where none was left to be solved.
     """
     stats: Stats | None = None
-    todo = [(n, tile) for n, tile in enumerate(tiles) if not bench.has(n)]
+    todo = [(n, tile) for n, tile in enumerate(tiles) if bench.get(n) is None]
     with bar(None, len(tiles), "tiles of lenslets") as progress:
         progress.update(len(tiles) - len(todo))
         for number, found in run_all(pool, ((job[0], task, job) for job in todo)):
@@ -156,7 +105,7 @@ def picture(
     """(value, sigma or None, how many values are negative and the sum of the tiles' `counts`) of a
     picture whose tiles are finished.
     """
-    first = read_arrays(bench.path(0))
+    first = bench.get(0)
     assert first is not None
     rows, columns = (n * max(tile.own[axis].stop for tile in tiles) for axis, n in enumerate(shape))
     size = (rows, columns) if bands == 1 else (bands, rows, columns)
@@ -170,6 +119,6 @@ def picture(
         )
         for which in range(len(first) - 1)
     ]
-    read = (read_arrays(bench.path(number)) for number in range(len(tiles)))
+    read = map(bench.get, range(len(tiles)))
     counted = sum(arrays[-1] for arrays in read if arrays is not None)
     return found[0], found[1] if len(found) > 1 else None, np.asarray(counted)

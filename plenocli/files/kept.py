@@ -86,11 +86,14 @@ def _digest(name: str, inputs: list[np.ndarray]) -> str:
     return digest.hexdigest()
 
 
-def _sum(path: Path, arrays: tuple[np.ndarray, ...]) -> str:
-    digest = hashlib.sha256(path.name.encode())
+def _sum(path: Path, arrays: tuple[np.ndarray, ...]) -> int:
+    """What damage would change: ten times as fast as a digest."""
+    from isal import isal_zlib
+
+    total = isal_zlib.crc32(path.name.encode())
     for values in arrays:
-        digest.update(values.data)
-    return digest.hexdigest()
+        total = isal_zlib.crc32(values.data, total)
+    return total
 
 
 def read_arrays(path: Path) -> tuple[np.ndarray, ...] | None:

@@ -18,6 +18,7 @@ import numpy as np
 
 from plenocli.base.device import CPU, Device, beside, namespace
 from plenocli.base.errors import NumericsError
+from plenocli.forward.propagation.complex_products import product_of_thirds, thirds
 from plenocli.forward.propagation.fresnel.spread_function import terms_within
 
 if TYPE_CHECKING:
@@ -297,23 +298,17 @@ def _product(x: Any, y: Any) -> Any:
 
 
 def _add_product(out: np.ndarray, x: np.ndarray, y: np.ndarray) -> None:
-    """out += x @ y, rows at a time, so that no second array of its size is needed; complex ones by
-    three real products in place of four, where products are what takes the time (Higham 1992).
-    """
+    """out += x @ y, rows at a time, so that no second array of its size is needed."""
     three = np.iscomplexobj(x) and np.iscomplexobj(y) and min(len(x), len(y)) >= THREE_SERVE
-    real, imaginary = (y.real.copy(), y.imag.copy()) if three else (y, y)
-    both = real + imaginary if three else y
+    parts = thirds(y) if three else ()
     for start in range(0, len(x), ROWS):
         part, target = x[start : start + ROWS], out[start : start + ROWS]
-        if not three:
+        if three:
+            real, imaginary = product_of_thirds(thirds(part), parts)
+            target.real += real
+            target.imag += imaginary
+        else:
             target += part @ y
-            continue
-        a, b = part.real.copy("K"), part.imag.copy("K")
-        first, second = a @ real, b @ imaginary
-        target.real += first - second
-        a += b
-        first += second
-        target.imag += a @ both - first
 
 
 def thin(matrix: np.ndarray) -> Matrix:

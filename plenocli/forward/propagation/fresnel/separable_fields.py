@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from plenocli.base.device import CPU, Device
+from plenocli.forward.propagation.complex_products import product_of_thirds, thirds
 
 WORK_BYTES = 1 << 22
 """Size of the product before it is squared: small beside the shared cache, large enough that the
@@ -163,11 +164,8 @@ class Factors:
 
     @cached_property
     def _thirds(self) -> tuple[np.ndarray, ...] | None:
-        """Real and imaginary parts of `high` and their sum, where these three serve."""
-        if self.high.shape[3] < THREE_SERVE:
-            return None
-        real, imaginary = self.high.real.copy(), self.high.imag.copy()
-        return real, imaginary, real + imaginary
+        """Of `high`, where they serve."""
+        return thirds(self.high) if self.high.shape[3] >= THREE_SERVE else None
 
     def _product(
         self, sy: int, chosen: slice | np.ndarray, right: tuple[np.ndarray, ...], out: np.ndarray
@@ -180,11 +178,8 @@ class Factors:
             left = self.high[sy, chosen].view(self.high.real.dtype)
             return np.matmul(left.reshape(len(out), -1), right[0], out=out)
         lefts = (part[sy, chosen].reshape(len(out), -1) for part in self._thirds)
-        first, second, both = (left @ part for left, part in zip(lefts, right))
-        width = first.shape[1]
-        np.subtract(first, second, out=out[:, :width])
-        both -= first
-        np.subtract(both, second, out=out[:, width:])
+        width = out.shape[1] // 2
+        out[:, :width], out[:, width:] = product_of_thirds(lefts, right)
         return out
 
     def _right(self, factor: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -193,7 +188,7 @@ class Factors:
         """
         turned = factor.T if self.signs is None else factor.T * self.signs[:, None]
         if self._thirds is not None:
-            return turned.real.copy(), turned.imag.copy(), turned.real + turned.imag
+            return thirds(turned)
         right = np.empty((len(turned), 2, 2, turned.shape[1]), factor.real.dtype)
         right[:, 0, 0] = right[:, 1, 1] = turned.real
         right[:, 0, 1] = turned.imag

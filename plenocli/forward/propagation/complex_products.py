@@ -1,0 +1,26 @@
+"""Products of large complex matrices by three real products in place of four (N. J. Higham, SIAM
+Journal on Matrix Analysis and Applications 13, 1992): a sixth less time, errors of like size.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+
+def thirds(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Real and imaginary part of a complex matrix and their sum, laid out as it is."""
+    real, imaginary = matrix.real.copy("K"), matrix.imag.copy("K")
+    return real, imaginary, real + imaginary
+
+
+def product_of_thirds(
+    left: Iterable[np.ndarray], right: Iterable[np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """(real part, imaginary part) of a product of matrices of which `thirds` are known."""
+    first, second, both = (a @ b for a, b in zip(left, right))
+    both -= first
+    both -= second
+    first -= second
+    return first, both

@@ -15,6 +15,7 @@ import numpy as np
 from plenocli.base.errors import NumericsError
 from plenocli.forward.propagation.exact.open_fields import OpenFields, offset_of, residual_of
 from plenocli.forward.propagation.fresnel.trial_columns import (
+    CHEAP,
     VALUES,
     Trial,
     TrialColumns,
@@ -65,13 +66,25 @@ def exact_trial_columns(
 ) -> TrialColumns | None:
     """As trial_columns, by the exact model where it tries all columns in time; else what both the
     paraxial model of more of them, and of neighbours that join, and the exact one ask for.
+
+    Neighbours join by the exact model where few pixels make that little work: fringes of far ones
+    are elsewhere than paraxial waves have them, which many pixels even out.
     """
     on_axis = replace(geometry, chief=(0.0, 0.0))
-    exact = trial_columns(camera, on_axis, grid, None, symmetric, ExactTrial)
-    if window is None and exact and exact.whole:
+    joined = window if _join_quickly(on_axis, grid, window, symmetric) else None
+    exact = trial_columns(camera, on_axis, grid, joined, symmetric, ExactTrial)
+    if window == joined and exact and exact.whole:
         return exact
     paraxial = trial_columns(camera, geometry, grid, window, symmetric)
     return _Both(**vars(paraxial), exact=exact) if paraxial and exact else paraxial
+
+
+def _join_quickly(
+    geometry: Geometry, grid: tuple[int, int], window: int | None, symmetric: bool
+) -> bool:
+    """Whether all columns are tried with their neighbours in little time."""
+    trial = ExactTrial(geometry, grid, window, symmetric, 1, None)
+    return trial.whole and trial.cost * len(trial.points) <= CHEAP
 
 
 @dataclass(frozen=True, kw_only=True)

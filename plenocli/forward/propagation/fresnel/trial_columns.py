@@ -169,7 +169,8 @@ def _tried(
         points = trial.points[: max(int(CHEAP / trial.cost), least)]
         if points and trial.values <= VALUES:
             light, fringes, within = trial.columns(hashed.camera, points)
-            whole = len(points) == len(trial.points) and trial.whole
+            all_join = near == window
+            whole = len(points) == len(trial.points) and trial.whole and all_join
             return TrialColumns(light=light, fringes=fringes, light_within=within, whole=whole)
     return None
 

@@ -35,7 +35,6 @@ HELD_BYTES = 12
 """Memory for a pixel that was put aside, while windows are worked on."""
 Room = Callable[[tuple[int, ...]], Any]
 """What gives room for values of a shape, zero at first, which are put and looked at by slices."""
-
 Keep = Callable[[int, Callable[[], Volume]], Volume]
 """What gives the volume of the window of a number: as an earlier run left it, or as it is made."""
 
@@ -194,7 +193,7 @@ class Tiles:
         for number, window in enumerate(bar(self.windows, len(self.windows), "windows")):
             part = first if number == best else self.keep(number, partial(make, window))
             joined.add(number, part)
-        del self._op  # its memory is that of all pixels that were put aside
+        vars(self).pop("_op", None)  # its memory is that of all pixels that were put aside
         return joined.volume()
 
     def _like(self, window: Window) -> np.ndarray | None:

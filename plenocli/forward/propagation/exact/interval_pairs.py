@@ -275,7 +275,7 @@ class Pair:
 
         reach: half width (m) of the superpixel;
         tolerance: root energy of a mean point's field that may be lost, about;
-        weak: as much again, of pairs of terms once it is seen what each brings.
+        weak: of the pairs of terms that may be left out once it is seen what each brings.
 
         Returns (X, X', K); X' is X where the pair is symmetric.
         """

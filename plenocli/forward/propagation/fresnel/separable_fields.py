@@ -25,6 +25,9 @@ WORK_BYTES = 1 << 22
 right-hand side is packed for several points.
 """
 
+THREE_SERVE = 300
+"""Terms from which on three real products take less time than the four of a complex one."""
+
 LINES_SERVE = 0.8
 """Share of the operations that fields multiplied line by line may take: they are moved once more.
 """
@@ -43,10 +46,6 @@ def field_operations(
 def lines_serve(nodes: tuple[int, int], terms: float, lines: tuple[int, int]) -> bool:
     """Whether fields are better multiplied on `lines`."""
     return field_operations(nodes, terms, lines) < LINES_SERVE * field_operations(nodes, terms)
-
-
-THREE_SERVE = 300
-"""Terms from which on three real products take less time than the four of a complex one."""
 
 
 class Factors:

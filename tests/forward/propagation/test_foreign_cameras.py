@@ -110,6 +110,11 @@ def test_a_pixel_of_many_lenslets_that_missed_holds(count):
     assert case.rung == "exact, openings" and case.true <= case.said < 1.2 * case.true
 
 
+def test_middles_of_edges_of_round_lenslets_that_missed_hold(count):
+    """Missed 2.6 times where the three points that a trial could afford were all of one row."""
+    assert len(summed([foreign.answer(1, 216)], count)) == 1
+
+
 @pytest.mark.slow
 def test_harmonics_of_very_dim_points_that_missed_hold(count, without_openings):
     """Missed 1.2 times: points between hexagons of 0.22 of their pitch."""

@@ -182,9 +182,9 @@ def _lines(count: int, symmetric: bool) -> list[int]:
 
 
 def _points(tried: list[list[int]], shape: tuple[int, int], symmetric: bool) -> list[Point]:
-    """Points on some lines along both axes in the order in which they are tried: of a pupil without
-    symmetry a corner, the middles of two edges, the next corner and so on; then corners, middles of
-    edges and the middle, and the farthest from it first.
+    """Points on some lines along both axes in the order in which they are tried: a corner and the
+    middles of two edges, of a pupil without symmetry the next corner and so on; then corners,
+    middles of edges and the middle, and the farthest from it first.
     """
     marks = [(line[0], line[len(line) // 2], line[-1]) for line in tried]
     order = sorted(
@@ -194,9 +194,9 @@ def _points(tried: list[list[int]], shape: tuple[int, int], symmetric: bool) -> 
             -sum(abs(2 * i / (n - 1 or 1) - 1) for i, n in zip(p, shape)),
         ),
     )
-    if symmetric:
-        return order
     (top, middle, bottom), (left, centre, right) = marks
+    if symmetric:  # the last lines are those of the middle
+        return list(dict.fromkeys([(top, left), (top, right), (bottom, left), *order]))
     corners: list[Point | None] = list(product((top, bottom), (left, right)))
     edges = [(top, centre), (bottom, centre)], [(middle, left), (middle, right)]
     first = (p for kinds in zip_longest(corners, *edges) for p in kinds if p)

@@ -73,7 +73,7 @@ class Tiles:
     device: of their map.
     like: (plane, row, column) before all lenslets, as volume_of takes it; may stay in a file.
     room: for the volume, plane by plane, that windows are joined to.
-    keep: of the volumes of several windows; may be set later.
+    keep: of the volumes of several windows, an attribute; nothing is kept where it is not set.
 
     Windows overlap by the lenslets that a voxel's light reaches, and fade into each other there.
     All have the same size, and so the same map.

@@ -38,7 +38,7 @@ def _arrays(volume: Volume) -> list[np.ndarray]:
         "prior": volume.prior and vars(volume.prior),
         "likeness": volume.likeness and vars(volume.likeness),
         "bars": volume.sigma is not None,
-        "held": held and [values.dtype.str for values in vars(held).values()],
+        "held": held and {name: values.dtype.str for name, values in vars(held).items()},
     }
     # of a text the numbers of its bytes: what is kept is numbers
     text = np.frombuffer(json.dumps(facts).encode(), np.uint8)
@@ -56,8 +56,8 @@ def _volume(arrays: tuple[np.ndarray, ...]) -> Volume:
     sigma = more.pop(0).astype(kind) if facts["bars"] else None
     held = None
     if facts["held"]:
-        typed = (values.astype(kind) for values, kind in zip(more, facts["held"]))
-        held = HeldOut(**dict(zip(("index", "measured", "predicted", "sigma"), typed)))
+        types = facts["held"].items()
+        held = HeldOut(**{name: some.astype(own) for (name, own), some in zip(types, more)})
     return Volume(
         value=value.astype(kind),
         sigma=sigma,

@@ -15,8 +15,13 @@ from scipy.special import eval_jacobi, roots_legendre
 
 from tests.reference.fresnel import lenslet_centre
 
-BLOCK = 1 << 21
-"""Values of the exact kernel that are in memory together."""
+try:
+    from numba import njit
+except ImportError:
+    njit = None
+
+BLOCK = 256
+"""Nodes of the sensor, and of a lenslet, between which the exact kernel is in memory together."""
 
 
 def paraxial(camera, points, lenslets, superpixels, *, window=None, extra=1.0):
@@ -56,30 +61,77 @@ def exact(camera, points, lenslets, superpixels, *, window=None, extra=1.0):
         total = np.zeros((len(points), len(v[0]), len(u[0])), complex)
         for lenslet in [place] if lenslets is None else lenslets:
             y, x = (a + c for a, c in zip(rule.opening(lenslet), rule.centre(lenslet)))
-            fields = rule.behind(points, lenslet).reshape(len(points), -1).T
-            beside = max(1, BLOCK // (len(x) * len(y)))
-            for first in range(0, len(u[0]), beside):
-                ours = slice(first, first + beside)
-                across = (u[0][ours, None, None] - x) ** 2
-                step = max(1, BLOCK // (across.size * len(y)))
-                for start in range(0, len(v[0]), step):
-                    some = slice(start, start + step)
-                    path = (v[0][some, None, None, None] - y[:, None]) ** 2 + across[:, :, :]
-                    squares = path + rule.z3**2
-                    r = np.sqrt(squares)
-                    # R - z3 without cancellation
-                    turns = path / (r + rule.z3) / rule.wavelength
-                    kernel = (
-                        rule.z3
-                        / squares
-                        * (1 + 1j / (rule.k * r))
-                        * np.exp(2j * np.pi * (turns % 1))
-                    )
-                    total[:, some, ours] += (kernel.reshape(-1, len(fields)) @ fields).T.reshape(
-                        len(points), -1, len(across)
-                    )
+            total += _to_sensor(rule, v[0], u[0], y, x, rule.behind(points, lenslet))
         found.append(rule.pixels(total / rule.wavelength, v, u))
     return np.stack(found, axis=1)
+
+
+def _to_sensor(rule, v, u, y, x, fields):
+    """Rayleigh and Sommerfeld's integral of fields at y, x: (point, v, u), without 1/wavelength."""
+    count = len(fields)
+    parts = np.concatenate([fields.real, fields.imag]).transpose(1, 2, 0)
+    across = (u[:, None] - x) ** 2
+    some, part = max(1, BLOCK // len(u)), max(1, BLOCK // len(x))
+    total = np.zeros((count, len(v), len(u)), complex)
+    waves = _fast_waves if njit else _waves
+    for first in range(0, len(v), some):
+        rows = slice(first, first + some)
+        for start in range(0, len(y), part):
+            down = (v[rows, None] - y[start : start + part]) ** 2
+            onto = parts[start : start + part].reshape(-1, 2 * count)
+            real, imag = (
+                (kernel.reshape(-1, len(onto)) @ onto).T.reshape(2, count, -1, len(u))
+                for kernel in waves(down, across, rule.z3, rule.wavelength)
+            )
+            total[:, rows] += real[0] - imag[1] + 1j * (real[1] + imag[0])
+    return total
+
+
+def _waves(down, across, z, wavelength):
+    """The kernel z/R^2 (1 + j/(k R)) exp(j k (R - z)): its parts, (v, u, y, x).
+
+    down, across: squares of what lies between sensor and lenslet, (v, y) and (u, x).
+    """
+    path = down[:, None, :, None] + across[:, None]
+    r = np.sqrt(path + z**2)
+    # R - z without cancellation
+    turns = path / (r + z) / wavelength
+    wave = z / r**2 * (1 + 1j * wavelength / (2 * np.pi * r)) * np.exp(2j * np.pi * (turns % 1))
+    return wave.real, wave.imag
+
+
+def _loops(down, across, z, wavelength):
+    rows, high = down.shape
+    columns, wide = across.shape
+    waves = 1 / wavelength
+    real = np.empty((rows, columns, high, wide))
+    imag = np.empty((rows, columns, high, wide))
+    for a in range(rows):
+        for b in range(columns):
+            for i in range(high):
+                for j in range(wide):
+                    path = down[a, i] + across[b, j]
+                    r = np.sqrt(path + z * z)
+                    near = 1 / r
+                    turns = path / (r + z) * waves
+                    # sine and cosine by their series within half a quadrant, then doubled
+                    t = (turns - np.floor(turns + 0.5)) * (np.pi / 2)
+                    q = t * t
+                    s = 1 - q / 110 * (1 - q / 156 * (1 - q / 210))
+                    s = t * (1 - q / 6 * (1 - q / 20 * (1 - q / 42 * (1 - q / 72 * s))))
+                    c = 1 - q / 132 * (1 - q / 182 * (1 - q / 240))
+                    c = 1 - q / 30 * (1 - q / 56 * (1 - q / 90 * c))
+                    c = 1 - q / 2 * (1 - q / 12 * c)
+                    s, c = 2 * s * c, 1 - 2 * s * s
+                    s, c = 2 * s * c, 1 - 2 * s * s
+                    size = z * near * near
+                    late = near * wavelength / (2 * np.pi)
+                    real[a, b, i, j] = size * (c - late * s)
+                    imag[a, b, i, j] = size * (s + late * c)
+    return real, imag
+
+
+_fast_waves = njit(fastmath=True, error_model="numpy", cache=True)(_loops) if njit else None
 
 
 class _Rule:

@@ -274,12 +274,6 @@ def _consider(request: _Request, model: Model) -> Candidate:
     )
     if reason:
         return Candidate(name=model.name, model=model.kind, why=reason)
-    fixed = {
-        "model": 0.0
-        if request.model != "auto"
-        else max(model.error_bound(request.seen(v), v) for v in request.geometries),
-        "storage": 3e-8 if request.dtype == np.float32 else 0.0,
-    }
     tried = []
     for ring in _rings_of(request, model):
         outside = (
@@ -289,7 +283,9 @@ def _consider(request: _Request, model: Model) -> Candidate:
         )
         # the rings that a user asks for are the user's model
         nodes, spectrum = _band_nodes(request, model, ring)
-        split = fixed | {
+        split = {
+            "model": 0.0 if request.model != "auto" else _error_bound(request, model, ring),
+            "storage": 3e-8 if request.dtype == np.float32 else 0.0,
             "spectrum": math.hypot(spectrum, request.dim),
             "neighbourhood": outside if len(request.rings) > 1 else 0.0,
         }
@@ -301,6 +297,17 @@ def _consider(request: _Request, model: Model) -> Candidate:
     # none serves: the fewest rings that come as near as any
     least = min(c.error for c in tried)
     return next(c for c in tried if c.error <= 1.1 * least)
+
+
+def _error_bound(request: _Request, model: Model, ring: int) -> float:
+    """Of the model against the finest one, at the shortest, the middle and the longest wavelength:
+    the pupil's image has most edges at one end, and diffraction is widest at the other.
+    """
+    some = sorted(request.geometries, key=lambda v: v.wavelength)
+    return max(
+        model.error_bound(request.seen(v), v, request.superpixels, ring)
+        for v in dict.fromkeys([some[0], some[len(some) // 2], some[-1]])
+    )
 
 
 def _rings_of(request: _Request, model: Model) -> Sequence[int]:
@@ -566,7 +573,7 @@ def _plan(request: _Request, found: list[Candidate], best: Candidate) -> PifPlan
 
 def _model_error(request: _Request, best: Candidate) -> float:
     model = next(m for m in MODELS if m.name == best.name)
-    error = max(model.error_bound(request.seen(v), v) for v in request.geometries)
+    error = _error_bound(request, model, best.ring)
     fitted = request.camera.fitted
     return error if fitted is None else math.hypot(error, fitted.model_error)
 

@@ -18,6 +18,8 @@ from plenocli.forward.propagation.costs import law
 from plenocli.forward.propagation.exact import cost_law, openings
 from plenocli.forward.propagation.exact import lenslets as exact
 from plenocli.forward.propagation.exact.oblique import neglected
+from plenocli.forward.propagation.exact.open_fields import too_near
+from plenocli.forward.propagation.exact.trial import paraxial_off
 from plenocli.forward.propagation.fresnel import paraxial_error, shaped, square_cost
 from plenocli.forward.propagation.fresnel.square import SquareLenslets
 from plenocli.forward.propagation.harmonics import cost_law as harmonic_cost
@@ -26,12 +28,20 @@ from plenocli.forward.propagation.harmonics import sizing as harmonic_sizing
 from plenocli.forward.propagation.lenslet_fields import LensletFields
 from plenocli.forward.propagation.plan import BandPlan, PifPlan
 from plenocli.forward.propagation.ray import rays
-from plenocli.forward.propagation.sampling import size_band
+from plenocli.forward.propagation.sampling import coherent_window, is_symmetric, size_band, touch
 
 if TYPE_CHECKING:
     from plenocli.forward.camera.geometry import Geometry
     from plenocli.forward.camera.model import Camera
     from plenocli.forward.propagation.costs import Cost, Features
+
+
+TRIED = 1.05
+"""Estimate over the error found on columns that were tried."""
+FEW_CELLS = 4.0
+"""Diffraction cells beyond which square lenslets that touch are as the law of paraxial errors was
+found on.
+"""
 
 
 class Model(ABC):
@@ -55,8 +65,14 @@ class Model(ABC):
         """None, or one sentence why the model cannot serve the camera."""
 
     @abstractmethod
-    def error_bound(self, camera: Camera, geometry: Geometry) -> float:
-        """Estimated relative L2 error of the worst column against the finest model."""
+    def error_bound(
+        self, camera: Camera, geometry: Geometry, superpixels: tuple[int, int], ring: int
+    ) -> float:
+        """Estimated relative L2 error of the worst column against the finest model.
+
+        superpixels: (rows, columns) kept;
+        ring: rings of coherent neighbours, 0 for isolated lenslets.
+        """
 
     @abstractmethod
     def size(
@@ -129,11 +145,26 @@ def _parabolic(camera: Camera) -> bool:
     return camera.lenslet_array.profile == "parabolic"
 
 
-def _paraxial_error(camera: Camera, geometry: Geometry) -> float:
-    return paraxial_error.paraxial_error(geometry, _parabolic(camera))
+def _paraxial_error(
+    camera: Camera, geometry: Geometry, superpixels: tuple[int, int], ring: int
+) -> float:
+    """As Model.error_bound: by a law; of other lenslets than those it was found on, by columns of
+    both models.
+    """
+    parabolic = _parabolic(camera)
+    if touch(geometry) and geometry.diffraction_cells > FEW_CELLS:
+        return paraxial_error.paraxial_error(geometry, parabolic)
+    found = None
+    if too_near(geometry) is None:
+        window = coherent_window(geometry, superpixels, ring)
+        found = paraxial_off(camera, geometry, superpixels, window, is_symmetric(camera))
+    least, most = found or (0.0, math.inf)
+    return paraxial_error.paraxial_error(geometry, parabolic, (TRIED * least, TRIED * most))
 
 
-def _error_off_the_axis(camera: Camera, geometry: Geometry) -> float:
+def _error_off_the_axis(
+    camera: Camera, geometry: Geometry, superpixels: tuple[int, int], ring: int
+) -> float:
     """Of the exact models: none on the axis, where they are what others are measured by; off it
     spherical waves are.
     """
@@ -148,12 +179,14 @@ class Rays(Model):
     size = staticmethod(rays.size_band)
     features = staticmethod(rays.features)
 
-    def error_bound(self, camera: Camera, geometry: Geometry) -> float:
+    def error_bound(
+        self, camera: Camera, geometry: Geometry, superpixels: tuple[int, int], ring: int
+    ) -> float:
         """As Model.error_bound; a law that is within 2.5 of what was measured promises only what
         its double is.
         """
-        beside_waves = 2 * rays.error_bound(camera, geometry)
-        return min(2.0, math.hypot(beside_waves, _paraxial_error(camera, geometry)))
+        waves = _paraxial_error(camera, geometry, superpixels, ring)
+        return min(2.0, math.hypot(2 * rays.error_bound(camera, geometry), waves))
 
 
 class FresnelLowRank(Model):
@@ -196,7 +229,9 @@ class ExactHarmonics(Model):
     size = staticmethod(harmonic_sizing.harmonic_band)
     features = staticmethod(harmonic_cost.features)
 
-    def error_bound(self, camera: Camera, geometry: Geometry) -> float:
+    def error_bound(
+        self, camera: Camera, geometry: Geometry, superpixels: tuple[int, int], ring: int
+    ) -> float:
         """None: it is what the others are measured by."""
         return 0.0
 

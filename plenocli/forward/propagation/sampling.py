@@ -73,8 +73,6 @@ UNTRIED, UNTRIED_WEIGHT = 1e-6, 3.0
 """Light that the dimmest point is expected to have where columns are too large to be tried, and by
 how much finer pixels are then sampled.
 """
-OTHERS = 6.0
-"""Columns tried from which on others are at most twice as bad, of few all the worse."""
 ASIDE, BENT = 1.5, 4.0
 """By how much finer pixels are sampled off the axis, and how much more where that changes a column
 by its own size.
@@ -211,7 +209,7 @@ def size_band(
     count = psf_nodes(geometry, half)
     light = own, joint, geometry.diffraction_cells, geometry.blur / geometry.D2
     cut_effect, errors, beside = PSF_CUT_EFFECT * tolerance, [], None
-    if geometry.lenslet_shape == "square" and geometry.lenslet_width >= TOUCHING * geometry.D2:
+    if touch(geometry):
         faintest = BRIGHT
         nodes, rule = pixel_nodes(accuracy, *light)
         errors.append(pixel_error(nodes, rule, *light))
@@ -232,7 +230,7 @@ def size_band(
         if tried is None:
             weight, error = UNTRIED_WEIGHT, _fringes_beside_gaps(geometry, light)
         else:
-            weight = beyond_tried(tried)
+            weight = tried.beyond
             error = (
                 tried.error if trial else partial(_worse, tried.error, _untried(geometry, light))
             )
@@ -268,9 +266,9 @@ def _finer_aside(geometry: Geometry) -> float:
     return ASIDE + BENT * min(1.0, oblique_error(geometry, False))
 
 
-def beyond_tried(tried: TrialColumns) -> float:
-    """By how much columns may be worse than those tried say."""
-    return 1.0 if tried.whole else 1 + (OTHERS / len(tried.light)) ** 1.5
+def touch(geometry: Geometry) -> bool:
+    """Whether lenslets are square and leave no gaps."""
+    return geometry.lenslet_shape == "square" and geometry.lenslet_width >= TOUCHING * geometry.D2
 
 
 def dimness(light: float) -> float:

@@ -32,7 +32,7 @@ class FakeModel:
     def valid_for(self, camera, geometry):
         return self.reason
 
-    def error_bound(self, camera, geometry):
+    def error_bound(self, camera, geometry, superpixels, ring):
         return self.error
 
     def size(self, camera, geometry, superpixels, ring, accuracy, tolerance):

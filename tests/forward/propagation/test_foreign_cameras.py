@@ -9,6 +9,7 @@ import pytest
 from plenocli.base.errors import NumericsError
 from plenocli.forward.camera.geometry import geometry
 from plenocli.forward.propagation.exact.open_fields import residual_of
+from plenocli.forward.propagation.models import model_named
 from plenocli.forward.propagation.system_matrix import build_pif
 from tests.forward.propagation import foreign
 from tests.forward.propagation.cameras import plan_pif, small_camera, system_matrix
@@ -113,6 +114,21 @@ def test_a_pixel_of_many_lenslets_that_missed_holds(count):
 def test_middles_of_edges_of_round_lenslets_that_missed_hold(count):
     """Missed 2.6 times where the three points that a trial could afford were all of one row."""
     assert len(summed([foreign.answer(1, 216)], count)) == 1
+
+
+@pytest.mark.parametrize("number, ring", [(1978, 0), (206, 0), (616, 0), (4554, 1), (10428, 1)])
+def test_paraxial_errors_that_a_law_missed_are_told(number, ring):
+    """A law said 0.2 to 0.8 of them: openings of few wavelengths, whose light goes far aside."""
+    camera = foreign.random_camera(np.random.default_rng((1, number)))
+    points, view = foreign.points_of(camera), geometry(camera, camera.light.wavelengths[0])
+    lenslets = foreign.lenslets_of(camera, 1) if ring else None
+    exact, paraxial = (
+        model(camera, points, lenslets, [(0, 0)]).reshape(len(points), -1)
+        for model in (tensor.exact, tensor.paraxial)
+    )
+    missed = np.linalg.norm(paraxial - exact, axis=1) / np.linalg.norm(exact, axis=1)
+    told = model_named("fresnel, triple product").error_bound(camera, view, (1, 1), ring)
+    assert missed.max() <= told < 1.2 * missed.max()
 
 
 @pytest.mark.slow

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,8 +18,10 @@ from plenocli.forward.propagation.exact.open_fields import OpenFields, offset_of
 from plenocli.forward.propagation.fresnel.trial_columns import (
     CHEAP,
     VALUES,
+    Hashed,
     Trial,
     TrialColumns,
+    near_window,
     trial_columns,
 )
 
@@ -26,6 +29,8 @@ if TYPE_CHECKING:
     from plenocli.forward.camera.geometry import Geometry
     from plenocli.forward.camera.model import Camera
 
+KEPT = 256
+"""Differences of models that are kept for the next plan of the same camera."""
 CUTS = 1e-8, 1e-7
 """What is left out of fields: of the spread function, and of the kernel."""
 
@@ -55,6 +60,38 @@ class ExactTrial(Trial):
             for start in range(0, len(points), step):
                 some = slice(start, start + step)
                 yield from enumerate(behind.on(place, nodes, rows[some], columns[some]), start)
+
+
+class _Beside(ExactTrial):
+    """The paraxial model on the nodes of an ExactTrial."""
+
+    fields = Trial.fields
+
+
+def paraxial_off(
+    camera: Camera, geometry: Geometry, grid: tuple[int, int], window: int | None, symmetric: bool
+) -> tuple[float, float] | None:
+    """The least and the most that the relative L2 difference of the worst paraxial column on the
+    axis from the exact one can be, as columns by both tell: the same where they are all that there
+    are; None where they would take too long.
+
+    Parameters as those of trial_columns.
+    """
+    on_axis = replace(geometry, chief=(0.0, 0.0))
+    return _off(Hashed(camera), on_axis, grid, near_window(geometry, window), symmetric)
+
+
+@lru_cache(maxsize=KEPT)
+def _off(
+    hashed: Hashed, geometry: Geometry, grid: tuple[int, int], window: int | None, symmetric: bool
+) -> tuple[float, float] | None:
+    asked = hashed.camera, geometry, grid, window, symmetric
+    exact, paraxial = (trial_columns(*asked, kind) for kind in (ExactTrial, _Beside))
+    if exact is None or paraxial is None:
+        return None
+    missed = np.linalg.norm(paraxial.pixels - exact.pixels, axis=1)
+    worst = float((missed / np.linalg.norm(exact.pixels, axis=1)).max())
+    return worst, exact.beyond * worst
 
 
 def exact_trial_columns(

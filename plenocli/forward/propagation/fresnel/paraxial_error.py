@@ -1,5 +1,6 @@
 """How far paraxial columns are from exact ones, told from where paraxial optics sends rays amiss:
-on the axis, and behind a lenslet that sees the pupil at an angle.
+on the axis, where columns that were computed by both tell more, and behind a lenslet that sees the
+pupil at an angle.
 """
 
 from __future__ import annotations
@@ -17,6 +18,8 @@ FEW_CELLS, MOST_BLUR = 5.0, 6.0
 """Diffraction cells up to which each lenslet that a blurred point lights adds its own error: the
 light of few cells goes far aside, and joins.
 """
+OTHER_SHAPES = 2.0
+"""What the law says too little of lenslets that leave gaps, or have few cells."""
 OBLIQUE = 1.7
 """Error of the worst column over the root mean square by which rays are moved in pupil images,
 times the root of the image's width over that of its rim (docs/model.md, "Exact propagation").
@@ -27,17 +30,25 @@ GRAZING = 1e-3
 """Squared cosine below which a ray is taken to go no flatter."""
 
 
-def paraxial_error(geometry: Geometry, parabolic: bool) -> float:
+def paraxial_error(
+    geometry: Geometry, parabolic: bool, tried: tuple[float, float] | None = None
+) -> float:
     """Estimated relative L2 error of the worst column of the paraxial model against the exact one,
     at the geometry's own place on the array.
 
-    parabolic: profile of the lenslets, else hyperbolic.
+    parabolic: profile of the lenslets, else hyperbolic;
+    tried: least and most that it can be on the axis, as columns that were computed tell; None for
+        lenslets such as the law was found on, square ones that touch.
 
     docs/model.md, "Exact propagation".
     """
-    own = math.hypot(_on_axis(geometry, parabolic), oblique_error(geometry, parabolic))
     few = min(1.0, FEW_CELLS / geometry.diffraction_cells)
-    return min(1.0, own * (1 + few * min(MOST_BLUR, geometry.blur / geometry.D2)))
+    lit = 1 + few * min(MOST_BLUR, geometry.blur / geometry.D2)
+    on_axis = lit * _on_axis(geometry, parabolic)
+    if tried is not None:
+        least, most = tried
+        on_axis = min(max(OTHER_SHAPES * on_axis, least), most)
+    return min(1.0, math.hypot(on_axis, lit * oblique_error(geometry, parabolic)))
 
 
 def oblique_error(geometry: Geometry, parabolic: bool) -> float:

@@ -37,9 +37,7 @@ Point = tuple[int, int]
 CHEAP, AFFORDED = 3e8, 6e8
 """Complex multiplications that a trial may take, and one of few points."""
 NEAR = 2
-"""Rings of lenslets around those under a point's blur whose fields are tried together: farther ones
-bring little light.
-"""
+"""Rings of lenslets around those under a point's blur whose fields are tried together."""
 FEW, LINES = 3, 8
 """Points that a trial should have, and the most lines of points along an axis."""
 VALUES = 1 << 22
@@ -50,6 +48,8 @@ QUICK = 160
 """Nodes of the spread function per axis up to which its terms are found rather than expected."""
 KEPT_VALUES = 1 << 20
 """Coefficients of light within pixels that a trial keeps, of one point at least."""
+OTHERS = 6.0
+"""Columns tried from which on others are at most twice as bad, of few all the worse."""
 KEPT = 16
 """Trials that are kept for the next plan of the same camera."""
 
@@ -63,6 +63,7 @@ class TrialColumns:
         norm, of the Legendre coefficients of the light within a pixel, both axes together;
     light_within: (some column, pixel, degree, degree) these coefficients of light itself, over the
         column's norm;
+    pixels: (column, pixel) light of each pixel looked at, as a share of the point's;
     whole: whether they are all columns that symmetry does not give, with all their lenslets and
         pixels.
     """
@@ -70,12 +71,18 @@ class TrialColumns:
     light: np.ndarray
     fringes: np.ndarray
     light_within: np.ndarray
+    pixels: np.ndarray
     whole: bool
 
     @property
     def faintest(self) -> float:
         """Least light of a point."""
         return float(self.light.min())
+
+    @property
+    def beyond(self) -> float:
+        """By how much columns may be worse than those tried say."""
+        return 1.0 if self.whole else 1 + (OTHERS / len(self.light)) ** 1.5
 
     def error(self, count: int, rule: int) -> float:
         """Relative error of the worst column by a rule for the nodes of a pixel.
@@ -108,9 +115,15 @@ def trial_columns(
     symmetric: whether pupil and wavefront are mirrored by both axes;
     kind: of trial; None: by the paraxial model.
     """
-    if window is not None:
-        window = min(window, math.ceil(geometry.blur / (2 * geometry.D2)) + NEAR)
-    return _tried(kind or Trial, _Hashed(camera), geometry, grid, window, symmetric)
+    near = near_window(geometry, window)
+    return _tried(kind or Trial, Hashed(camera), geometry, grid, near, symmetric)
+
+
+def near_window(geometry: Geometry, window: int | None) -> int | None:
+    """Coherent lenslets on either side that a trial looks at: farther ones bring little light."""
+    if window is None:
+        return None
+    return min(window, math.ceil(geometry.blur / (2 * geometry.D2)) + NEAR)
 
 
 def cut_field(
@@ -124,10 +137,10 @@ def cut_field(
     """
     if psf_nodes(geometry, half) > QUICK:
         return None
-    return _cut(_Hashed(camera), geometry, half, tolerance)
+    return _cut(Hashed(camera), geometry, half, tolerance)
 
 
-class _Hashed:
+class Hashed:
     """A camera with what its files hold, as a key."""
 
     def __init__(self, camera: Camera) -> None:
@@ -143,11 +156,11 @@ class _Hashed:
         return hash(self._key)
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Hashed) and self._key == other._key
+        return isinstance(other, Hashed) and self._key == other._key
 
 
 @lru_cache(maxsize=KEPT)
-def _cut(hashed: _Hashed, geometry: Geometry, half: float, tolerance: float) -> tuple[int, float]:
+def _cut(hashed: Hashed, geometry: Geometry, half: float, tolerance: float) -> tuple[int, float]:
     field = separable_field(hashed.camera, geometry, half, tolerance)
     return field.terms, field.tail
 
@@ -155,7 +168,7 @@ def _cut(hashed: _Hashed, geometry: Geometry, half: float, tolerance: float) -> 
 @lru_cache(maxsize=KEPT)
 def _tried(
     kind: Callable[..., Trial],
-    hashed: _Hashed,
+    hashed: Hashed,
     geometry: Geometry,
     grid: tuple[int, int],
     window: int | None,
@@ -168,10 +181,8 @@ def _tried(
         least = min(int(AFFORDED / trial.cost), trial.least)
         points = trial.points[: max(int(CHEAP / trial.cost), least)]
         if points and trial.values <= VALUES:
-            light, fringes, within = trial.columns(hashed.camera, points)
-            all_join = near == window
-            whole = len(points) == len(trial.points) and trial.whole and all_join
-            return TrialColumns(light=light, fringes=fringes, light_within=within, whole=whole)
+            every = len(points) == len(trial.points) and trial.whole and near == window
+            return TrialColumns(**trial.columns(hashed.camera, points), whole=every)
     return None
 
 
@@ -286,12 +297,11 @@ class Trial:
         each = sum(v * c * self.few * (r * self.few + u) for r, c in self._lenslets)
         return float(len(self.places) * each)
 
-    def columns(
-        self, camera: Camera, points: list[tuple[int, int]]
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(light, fringes, light_within) of points, as TrialColumns has them."""
+    def columns(self, camera: Camera, points: list[tuple[int, int]]) -> dict[str, np.ndarray]:
+        """light, fringes, light_within and pixels of points, as TrialColumns has them."""
         m, count = self.degrees, len(points)
-        light, norm, gram = np.zeros(count), np.zeros(count), np.zeros((count, m, m))
+        gram = np.zeros((count, m, m))
+        pixels: list[list[np.ndarray]] = [[] for _ in points]
         within: list[list[np.ndarray]] = [[] for _ in points[: self.looked_into]]
         # from the light at a pixel's nodes, weights included, to Legendre coefficients over half of
         # the pixel
@@ -303,13 +313,20 @@ class Trial:
             series = onto @ energy.sum(axis=3).transpose(1, 0, 2).reshape(m, -1)
             series += onto @ energy.sum(axis=1).transpose(2, 0, 1).reshape(m, -1)
             gram[n] += series @ series.T
-            norm[n] += float((energy.sum(axis=(1, 3)) ** 2).sum())
-            light[n] += float(energy.sum()) / math.prod(self.sampled)
+            pixels[n].append(energy.sum(axis=(1, 3)).ravel())
             if n < len(within):
                 series = onto @ energy.transpose(0, 2, 1, 3) @ onto.T
                 within[n].append(series.reshape(-1, m, m).astype(np.float32))
-        scale = np.sqrt(norm[: len(within), None, None, None]).astype(np.float32)
-        return light, gram / norm[:, None, None], np.stack([*map(np.concatenate, within)]) / scale
+        seen = np.stack([*map(np.concatenate, pixels)])
+        norm = np.linalg.norm(seen, axis=1)[:, None, None]
+        inside = np.stack([*map(np.concatenate, within)])
+        inside /= norm[: len(within), :, :, None].astype(np.float32)
+        return {
+            "light": seen.sum(axis=1) / math.prod(self.sampled),
+            "fringes": gram / norm**2,
+            "light_within": inside,
+            "pixels": seen,
+        }
 
     def fields(
         self, camera: Camera, points: list[tuple[int, int]]

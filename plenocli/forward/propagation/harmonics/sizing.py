@@ -16,7 +16,7 @@ from plenocli.forward.propagation.fresnel.paraxial_error import paraxial_error
 from plenocli.forward.propagation.harmonics.bessel import bessel_tail
 from plenocli.forward.propagation.harmonics.interpolation import tap_error
 from plenocli.forward.propagation.plan import BandPlan
-from plenocli.forward.propagation.sampling import beyond_tried, dimness, is_symmetric, pixel_error
+from plenocli.forward.propagation.sampling import dimness, is_symmetric, pixel_error
 
 if TYPE_CHECKING:
     from plenocli.forward.camera.geometry import Geometry
@@ -101,7 +101,7 @@ def harmonic_band(
 
     def missed(count: int) -> float:
         if tried is not None:
-            return beyond_tried(tried) * tried.error(count, 0)
+            return tried.beyond * tried.error(count, 0)
         return PIXEL_EFFECT * pixel_error(count, 0, own, own, g.diffraction_cells, g.blur / g.D2)
 
     nodes = next((n for n in range(2, MOST_NODES) if missed(n) <= SHARE * accuracy), None)

@@ -66,6 +66,14 @@ def exact(camera, points, lenslets, superpixels, *, window=None, extra=1.0):
     return np.stack(found, axis=1)
 
 
+def kernel_values(camera, lenslets, superpixels):
+    """Values of the kernel that `exact` takes, a few nanoseconds each."""
+    rule = _Rule(camera, lenslets, superpixels, None, 1.0, True)
+    lit = 1 if lenslets is None else len(lenslets)
+    on_sensor = np.prod(camera.sensor.pixels_per_lenslet) * float(rule.pixel_nodes) ** 2
+    return len(superpixels) * lit * rule.lenslet_nodes**2 * on_sensor
+
+
 def _to_sensor(rule, v, u, y, x, fields):
     """Rayleigh and Sommerfeld's integral of fields at y, x: (point, v, u), without 1/wavelength."""
     count = len(fields)

@@ -116,7 +116,7 @@ def test_slow_lenslets_with_neighbours_are_paraxial(by, shape, lattice):
     truth = by("fresnel, triple product", camera, accuracy=1e-5, model="fresnel", **request)
     plan, matrix = by("exact, openings", camera, accuracy=1e-4, model="exact", **request)
     error = missed(matrix.A[0], truth[1].A[0])
-    assert error < truth[0].model_error < 4e-3
+    assert error < truth[0].model_error < 8e-3
     assert error > 0.1 * truth[0].model_error
 
 

@@ -128,8 +128,8 @@ def random_camera(rng):
     )
 
 
-def case(seed, number, model=None):
-    """The case of so many of a seed: (camera, request)."""
+def case(seed, number, model=None, finer=(1, 7)):
+    """The case of so many of a seed, asked for 10^-finer: (camera, request)."""
     rng = np.random.default_rng((seed, number))
     camera = random_camera(rng)
     kind = rng.uniform()
@@ -140,7 +140,7 @@ def case(seed, number, model=None):
         "model": model or str(rng.choice(["fresnel", "fresnel", "auto"])),
         "superpixels": grid,
         "coherent_ring": ring,
-        "accuracy": float(10.0 ** -rng.uniform(1, 7)),
+        "accuracy": float(10.0 ** -rng.uniform(*finer)),
     }
 
 
@@ -216,9 +216,9 @@ def points_of(camera):
     ]
 
 
-def answer(seed, number, model=None):
+def answer(seed, number, model=None, finer=(1, 7)):
     """The Case, None where the oracle would take too long."""
-    camera, request = case(seed, number, model)
+    camera, request = case(seed, number, model, finer)
 
     def truth(plan):
         window, reach = plan.bands[0].window, [(n - 1) // 2 for n in plan.superpixels]
@@ -226,8 +226,6 @@ def answer(seed, number, model=None):
             (r, c) for r in range(-reach[0], reach[0] + 1) for c in range(-reach[1], reach[1] + 1)
         ]
         lenslets = None if window is None else lenslets_of(camera, window)
-        if plan.rung == "rays":
-            return None
         if request["model"] == "fresnel":
             dear, oracle = _work(camera, plan) > AFFORDED, tensor.paraxial
         else:

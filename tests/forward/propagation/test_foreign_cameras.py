@@ -20,6 +20,8 @@ SAMPLE, PART, PARTS = 16, 50, 40
 """Cameras of the default tests; of each part of a campaign, and its parts: 2000 in all."""
 OBLIQUE, OBLIQUE_PARTS = 8, 6
 """The same of lenslets off the axis: 300 in all."""
+COARSE, COARSE_SAMPLE = (0.2, 1.3), 24
+"""Accuracies of coarse answers, as powers of a tenth; cameras of the default tests."""
 CENTRED, CENTRED_PARTS = (342, 442), 20
 """Of seed 41, two cameras whose lenslets are round or hexagonal, isolated and on the axis, of few
 fringes; parts of a campaign that looks for such.
@@ -50,6 +52,13 @@ def test_a_sample_of_foreign_cameras_holds(count):
     done = summed(cases, count)
     assert len(done) > 0.6 * SAMPLE
     assert sum(c.told for c in done) > 0.8 * len(done)
+
+
+def test_a_sample_of_coarse_answers_holds(count):
+    """Rays served cameras of whose points some lie between lenslets, dark to rays."""
+    cases = [foreign.answer(51, n, "auto", COARSE) for n in range(COARSE_SAMPLE)]
+    done = summed([c for c in cases if c], count)
+    assert len(done) > 0.6 * COARSE_SAMPLE and any(c.rung != done[0].rung for c in done)
 
 
 def test_a_sample_of_lenslets_off_the_axis_holds(count):

@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from plenocli.forward.camera.geometry import ROW_SPACING
 from plenocli.forward.camera.pupil import aperture_area, filter_cells, unit_radius
 from plenocli.forward.propagation.costs import Features, law
 from plenocli.forward.propagation.lenslet_fields import (
@@ -47,6 +48,8 @@ PupilMeasure = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """(y, x) (m, broadcasting) -> share of the open aperture at smaller y and smaller x."""
 WORK_CORNERS = 1 << 17
 """Corners of rectangles in a work array: about what a second-level cache holds."""
+DARK = 2.0
+"""Error of points that are dark to rays: as good as none serves."""
 FOCUSED = 1e-9
 """An image of a whole pupil smaller than this share of a pixel or a lenslet is a point."""
 
@@ -105,17 +108,69 @@ def error_bound(camera: Camera, geometry: Geometry) -> float:
     z2) cells; but a point d cells from the border between two lenslets sends its light through
     both. Out of focus that border cuts every image.
 
+    What of its light that takes is missed as well (`_missed`). A point that is imaged beside the
+    openings is dark to rays, and all its light is diffraction.
+
     Returns a number within 2.5 of the error of 132 cases (N from 3 to 47, c from 0.06 to 16, blur
-    from 0 to 3 lenslets; docs/model.md).
+    from 0 to 3 lenslets; docs/model.md), DARK where a point is beside openings.
     """
     cells, fit = (
         geometry.diffraction_cells,
         geometry.D2 * geometry.pixel_active / (geometry.wavelength * geometry.z3),
     )
-    border = cells / (2 * max(geometry.object_shape))
-    focused = math.hypot(0.9 / (cells * (1 + fit)) ** 0.7, 2 / (1 + 5 * border) / (1 + fit / 4))
+    border, cut = _border(camera, geometry)
+    if border <= 0 and geometry.blur < geometry.D2:
+        return DARK
     blurred = (1 + 2 / cells) / (1 + fit) if geometry.blur * cells > geometry.D2 else 0.0
-    return min(2.0, max(focused, blurred))
+    focused = math.hypot(
+        0.9 / (cells * (1 + fit)) ** 0.7, 2 / (1 + 5 * max(border, 0.0)) / (1 + fit / 4)
+    )
+    return min(DARK, math.hypot(max(focused, blurred), cut))
+
+
+def _border(camera: Camera, geometry: Geometry) -> tuple[float, float]:
+    """Of the points nearest the edge of their lenslet: how far within it they lie, in diffraction
+    cells, negative beside it; and the light that edges take, over what is left.
+    """
+    g = geometry
+    _, *tilt = _affine(camera.main_lens, g)
+    y, x = (np.abs(g.points(n) + g.z2 * tilt[n]) for n in (0, 1))
+    half, in_cells = g.lenslet_width / 2, g.diffraction_cells / g.D2
+    if g.lenslet_shape == "square":
+        away = max(y.max(), x.max())
+    elif g.lenslet_shape == "circle":
+        away = np.hypot(y.max(), x.max())
+    else:
+        away = np.maximum(x, x / 2 + ROW_SPACING * y[:, None]).max()
+    border = float(half - away) * in_cells
+    if g.lenslet_shape == "square":
+        sides = [((half - at.max()) * in_cells, (half + at.max()) * in_cells) for at in (y, x)]
+    else:
+        sides = [(border, border)] * 2
+    cut, disc = _taken(camera, sides), g.blur * in_cells
+    if disc > 1:
+        # a lenslet has its part of the pupil, whose edges are all its own
+        part = half * in_cells * min(1.0, g.D2 / g.blur)
+        cut = max(cut / disc, _taken(camera, [(part, part)] * 2))
+    return border, cut
+
+
+def _taken(camera: Camera, sides: list[tuple[float, float]]) -> float:
+    """Light that edges so far away (cells) along either axis take, over what they leave: once of
+    what enters a lenslet, and once of its pixels, which the pupil's image fills.
+    """
+    kept = math.prod(1 - sum(_missed(camera, cells) for cells in pair) for pair in sides)
+    return max(kept, 1e-3) ** -2 - 1
+
+
+def _missed(camera: Camera, cells: float) -> float:
+    """Share of a sharp point's light beyond an edge so many diffraction cells away: half at it, and
+    far off what the pupil's rim diffracts there, which goes by its length over the pupil's area.
+    """
+    lens = camera.main_lens
+    rim = 1.0 if lens.aperture_shape == "square" else 4 / math.pi
+    away = max(cells, 0.0) / rim * (1 - lens.obscuration)
+    return 0.5 / (1 + 2 * away + (math.pi**2 - 2) * away**2 / (1 + away))
 
 
 def features(

@@ -186,7 +186,7 @@ class Rays(Model):
         its double is.
         """
         waves = _paraxial_error(camera, geometry, superpixels, ring)
-        return min(2.0, math.hypot(2 * rays.error_bound(camera, geometry), waves))
+        return min(2.0, math.hypot(2 * rays.error_bound(camera, geometry, ring > 0), waves))
 
 
 class FresnelLowRank(Model):

@@ -34,12 +34,12 @@ if TYPE_CHECKING:
 
 Point = tuple[int, int]
 """(row, column) of the object."""
-CHEAP, AFFORDED = 3e8, 6e8
-"""Complex multiplications that a trial may take, and one of few points."""
+CHEAP, AFFORDED = 3e8, 9e8
+"""Complex multiplications that a trial may take, and one of few points or of all."""
 NEAR = 2
 """Rings of lenslets around those under a point's blur whose fields are tried together."""
-FEW, LINES = 3, 8
-"""Points that a trial should have, and the most lines of points along an axis."""
+FEW, LINES = 4, 8
+"""Points of a symmetric pupil that a trial should have, and the most lines of points along an axis."""
 VALUES = 1 << 22
 """Values of the spread function, or on the sensor, that it may hold."""
 THINNED = 12, 6
@@ -178,11 +178,12 @@ def _tried(
     lenslets = [None] if window is None else range(window, 0, -1)
     for near, beside, lines in product(lenslets, (1, 0), (None, *THINNED)):
         trial = kind(geometry, grid, near, symmetric, beside, lines)
-        least = min(int(AFFORDED / trial.cost), trial.least)
+        every = len(trial.points) * trial.cost <= AFFORDED
+        least = len(trial.points) if every else min(int(AFFORDED / trial.cost), trial.least)
         points = trial.points[: max(int(CHEAP / trial.cost), least)]
         if points and trial.values <= VALUES:
-            every = len(points) == len(trial.points) and trial.whole and near == window
-            return TrialColumns(**trial.columns(hashed.camera, points), whole=every)
+            whole = len(points) == len(trial.points) and trial.whole and near == window
+            return TrialColumns(**trial.columns(hashed.camera, points), whole=whole)
     return None
 
 
@@ -193,9 +194,9 @@ def _lines(count: int, symmetric: bool) -> list[int]:
 
 
 def _points(tried: list[list[int]], shape: tuple[int, int], symmetric: bool) -> list[Point]:
-    """Points on some lines along both axes in the order in which they are tried: a corner and the
-    middles of two edges, of a pupil without symmetry the next corner and so on; then corners,
-    middles of edges and the middle, and the farthest from it first.
+    """Points on some lines along both axes in the order in which they are tried: a corner, the
+    middles of two edges and the middle, of a pupil without symmetry the next corner and so on; then
+    the farthest from the middle first.
     """
     marks = [(line[0], line[len(line) // 2], line[-1]) for line in tried]
     order = sorted(
@@ -207,11 +208,12 @@ def _points(tried: list[list[int]], shape: tuple[int, int], symmetric: bool) -> 
     )
     (top, middle, bottom), (left, centre, right) = marks
     if symmetric:  # the last lines are those of the middle
-        return list(dict.fromkeys([(top, left), (top, right), (bottom, left), *order]))
+        first = [(top, left), (top, right), (bottom, left), (bottom, right)]
+        return list(dict.fromkeys([*first, *order]))
     corners: list[Point | None] = list(product((top, bottom), (left, right)))
     edges = [(top, centre), (bottom, centre)], [(middle, left), (middle, right)]
-    first = (p for kinds in zip_longest(corners, *edges) for p in kinds if p)
-    return list(dict.fromkeys([*first, *order]))
+    first = [p for kinds in zip_longest(corners, *edges) for p in kinds if p]
+    return list(dict.fromkeys([*first[:3], (middle, centre), *first[3:], *order]))
 
 
 def _pixel_lines(geometry: Geometry, count: int, most: int | None) -> tuple[list[int], float]:
@@ -267,7 +269,7 @@ class Trial:
             (n + symmetric) // (1 + symmetric) <= LINES for n in g.object_shape
         )
         # a pupil without symmetry has no two points alike
-        self.least = FEW if symmetric else 2 * FEW
+        self.least = FEW if symmetric else 2 * FEW - 1
         tried = [_lines(n, symmetric) for n in g.object_shape]
         self.points = _points(tried, g.object_shape, symmetric)
 

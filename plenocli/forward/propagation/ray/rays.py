@@ -100,7 +100,7 @@ def size_band(
     )
 
 
-def error_bound(camera: Camera, geometry: Geometry) -> float:
+def error_bound(camera: Camera, geometry: Geometry, joined: bool) -> float:
     """Estimated relative L2 error of the worst column against the Fresnel model.
 
     Diffraction rounds off every edge of the pupil's image over one cell, lambda z3/D2 wide: c = D2
@@ -111,6 +111,8 @@ def error_bound(camera: Camera, geometry: Geometry) -> float:
     What of its light that takes is missed as well (`_missed`). A point that is imaged beside the
     openings is dark to rays, and all its light is diffraction.
 
+    joined: whether the fields of neighbours add.
+
     Returns a number within 2.5 of the error of 132 cases (N from 3 to 47, c from 0.06 to 16, blur
     from 0 to 3 lenslets; docs/model.md), DARK where a point is beside openings.
     """
@@ -118,7 +120,7 @@ def error_bound(camera: Camera, geometry: Geometry) -> float:
         geometry.diffraction_cells,
         geometry.D2 * geometry.pixel_active / (geometry.wavelength * geometry.z3),
     )
-    border, cut = _border(camera, geometry)
+    border, cut = _border(camera, geometry, joined)
     if border <= 0 and geometry.blur < geometry.D2:
         return DARK
     blurred = (1 + 2 / cells) / (1 + fit) if geometry.blur * cells > geometry.D2 else 0.0
@@ -128,7 +130,7 @@ def error_bound(camera: Camera, geometry: Geometry) -> float:
     return min(DARK, math.hypot(max(focused, blurred), cut))
 
 
-def _border(camera: Camera, geometry: Geometry) -> tuple[float, float]:
+def _border(camera: Camera, geometry: Geometry, joined: bool) -> tuple[float, float]:
     """Of the points nearest the edge of their lenslet: how far within it they lie, in diffraction
     cells, negative beside it; and the light that edges take, over what is left.
     """
@@ -149,9 +151,11 @@ def _border(camera: Camera, geometry: Geometry) -> tuple[float, float]:
         sides = [(border, border)] * 2
     cut, disc = _taken(camera, sides), g.blur * in_cells
     if disc > 1:
-        # a lenslet has its part of the pupil, whose edges are all its own
+        # a lenslet alone has its part of the pupil, whose edges are all its own; what neighbours
+        # that join lose they give each other
         part = half * in_cells * min(1.0, g.D2 / g.blur)
-        cut = max(cut / disc, _taken(camera, [(part, part)] * 2))
+        own = 0.0 if joined else _taken(camera, [(part, part)] * 2)
+        cut = max(cut / disc, own)
     return border, cut
 
 

@@ -39,7 +39,7 @@ CHEAP, AFFORDED = 3e8, 9e8
 NEAR = 2
 """Rings of lenslets around those under a point's blur whose fields are tried together."""
 FEW, LINES = 4, 8
-"""Points of a symmetric pupil that a trial should have, and the most lines of points along an axis."""
+"""Points of a symmetric pupil that a trial should have, and the most lines of points per axis."""
 VALUES = 1 << 22
 """Values of the spread function, or on the sensor, that it may hold."""
 THINNED = 12, 6

@@ -183,7 +183,7 @@ def _tried(
         points = trial.points[: max(int(CHEAP / trial.cost), least)]
         if points and trial.values <= VALUES:
             whole = len(points) == len(trial.points) and trial.whole and near == window
-            return TrialColumns(**trial.columns(hashed.camera, points), whole=whole)
+            return trial.columns(hashed.camera, points, whole)
     return None
 
 
@@ -299,8 +299,8 @@ class Trial:
         each = sum(v * c * self.few * (r * self.few + u) for r, c in self._lenslets)
         return float(len(self.places) * each)
 
-    def columns(self, camera: Camera, points: list[tuple[int, int]]) -> dict[str, np.ndarray]:
-        """light, fringes, light_within and pixels of points, as TrialColumns has them."""
+    def columns(self, camera: Camera, points: list[Point], whole: bool) -> TrialColumns:
+        """Columns of points, which are the `whole` or not."""
         m, count = self.degrees, len(points)
         gram = np.zeros((count, m, m))
         pixels: list[list[np.ndarray]] = [[] for _ in points]
@@ -323,12 +323,13 @@ class Trial:
         norm = np.linalg.norm(seen, axis=1)[:, None, None]
         inside = np.stack([*map(np.concatenate, within)])
         inside /= norm[: len(within), :, :, None].astype(np.float32)
-        return {
-            "light": seen.sum(axis=1) / math.prod(self.sampled),
-            "fringes": gram / norm**2,
-            "light_within": inside,
-            "pixels": seen,
-        }
+        return TrialColumns(
+            light=seen.sum(axis=1) / math.prod(self.sampled),
+            fringes=gram / norm**2,
+            light_within=inside,
+            pixels=seen,
+            whole=whole,
+        )
 
     def fields(
         self, camera: Camera, points: list[tuple[int, int]]

@@ -276,11 +276,7 @@ def _consider(request: _Request, model: Model) -> Candidate:
         return Candidate(name=model.name, model=model.kind, why=reason)
     tried = []
     for ring in _rings_of(request, model):
-        outside = (
-            0.0
-            if model.kind == "ray"
-            else max(window_error(v, request.superpixels, ring) for v in request.geometries)
-        )
+        outside = 0.0 if model.kind == "ray" else _left_out(request, ring)
         # the rings that a user asks for are the user's model
         nodes, spectrum = _band_nodes(request, model, ring)
         split = {
@@ -303,11 +299,20 @@ def _error_bound(request: _Request, model: Model, ring: int) -> float:
     """Of the model against the finest one, at the shortest, the middle and the longest wavelength:
     the pupil's image has most edges at one end, and diffraction is widest at the other.
     """
-    some = sorted(request.geometries, key=lambda v: v.wavelength)
     return max(
-        model.error_bound(request.seen(v), v, request.superpixels, ring)
-        for v in dict.fromkeys([some[0], some[len(some) // 2], some[-1]])
+        model.error_bound(request.seen(v), v, request.superpixels, ring) for v in _ends(request)
     )
+
+
+def _left_out(request: _Request, ring: int) -> float:
+    """Of lenslets beyond the coherent window, at the worst wavelength of those of _error_bound."""
+    return max(window_error(request.seen(v), v, request.superpixels, ring) for v in _ends(request))
+
+
+def _ends(request: _Request) -> list[Geometry]:
+    """Of the shortest, the middle and the longest wavelength."""
+    some = sorted(request.geometries, key=lambda v: v.wavelength)
+    return list(dict.fromkeys([some[0], some[len(some) // 2], some[-1]]))
 
 
 def _rings_of(request: _Request, model: Model) -> Sequence[int]:
@@ -530,7 +535,7 @@ def _plan(request: _Request, found: list[Candidate], best: Candidate) -> PifPlan
         for c in found
     )
     warnings = [*request.warnings, *_warnings(request, best)]
-    window = max(window_error(v, request.superpixels, best.ring) for v in request.geometries)
+    window = _left_out(request, best.ring)
     if best.ring and best.model != "ray":
         request.left_out.append(
             f"lenslets beyond {best.ring} ring(s) of coherent neighbours: error about {window:.1g}"

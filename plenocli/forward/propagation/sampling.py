@@ -21,6 +21,7 @@ from plenocli.forward.propagation.fresnel.spread_function import psf_nodes
 from plenocli.forward.propagation.fresnel.spread_terms import expected_terms
 from plenocli.forward.propagation.fresnel.trial_columns import (
     TrialColumns,
+    change_by_ring,
     cut_field,
     trial_columns,
 )
@@ -67,6 +68,12 @@ PSF_CUT_EFFECT = 0.3
 """
 TOUCHING = 0.999
 """Width of square lenslets over their pitch from which on no point lies in a gap."""
+SLOWER, BLURRED = (1.7, 1.3), 1.6
+"""Factor, and power of the rings, by which light of far lenslets falls off more slowly where these
+do not touch; how much more is left out of focus.
+"""
+UNTRIED_RING, LEAST_RING = 6.0, 0.5
+"""How much more than the law a ring changes where that could not be tried, and at least."""
 BRIGHT = 0.25
 """Light of the dimmest point of square lenslets that touch: a corner's, which four share."""
 UNTRIED, UNTRIED_WEIGHT = 1e-6, 3.0
@@ -87,26 +94,48 @@ over the spread function's cut.
 """
 
 
-def window_error(geometry: Geometry, superpixels: tuple[int, int], ring: int) -> float:
-    """Estimated error because lenslets beyond the coherent window are left out.
-
-    Far lenslets interfere with the own one in fringes of (w + 1) c cycles a pixel, which pixels
-    average.
+def window_error(
+    camera: Camera, geometry: Geometry, superpixels: tuple[int, int], ring: int
+) -> float:
+    """Estimated error because lenslets beyond the coherent window are left out: by a law, which is
+    that of square lenslets that touch. Of others what their second ring changes tells how much
+    larger it is, and it falls off more slowly.
 
     superpixels: (rows, columns) kept;
     ring: of coherent neighbours.
 
-    Returns the relative L2 error of a column, within a factor of 2 of brute force (N from 5.6 to 24
-    diffraction cells, c from 0.1 to 7.5, w from 1 to 6; worst point, docs/model.md); 0 where ring
-    is 0 by choice.
+    Returns the relative L2 error of a column; 0 where ring is 0 by choice.
     """
-    window = coherent_window(geometry, superpixels, ring)
-    if window is None:
+    if ring == 0:
         return 0.0
-    blur = blur_ring(geometry)
-    # light spread over several lenslets has no sharp peak at a border, whose
-    # interference reaches furthest
-    window = window - blur + (blur > 0)
+    error = _law_of_windows(geometry, superpixels, ring)
+    if touch(geometry):
+        return error
+    nearest = coherent_window(geometry, (1, 1), 1) or 1
+    changed = change_by_ring(camera, geometry, nearest, is_symmetric(camera))
+    first = _law_of_windows(geometry, (1, 1), 1)
+    larger = UNTRIED_RING if changed is None else max(LEAST_RING, changed / first)
+    larger *= BLURRED if geometry.blur else 1.0
+    far = _sharp_window(geometry, superpixels, ring)
+    return min(1.0, SLOWER[0] * far ** SLOWER[1] * larger * error)
+
+
+def _sharp_window(geometry: Geometry, superpixels: tuple[int, int], ring: int) -> int:
+    """Lenslets on either side as a sharp point has them: light spread over several lenslets has no
+    sharp peak at a border, whose interference reaches furthest.
+    """
+    window, blur = coherent_window(geometry, superpixels, ring) or 0, blur_ring(geometry)
+    return window - blur + (blur > 0)
+
+
+def _law_of_windows(geometry: Geometry, superpixels: tuple[int, int], ring: int) -> float:
+    """window_error of square lenslets that touch, within a factor of 2 of brute force (N from 5.6
+    to 24 diffraction cells, c from 0.1 to 7.5, w from 1 to 6; worst point, docs/model.md).
+
+    Far lenslets interfere with the own one in fringes of (w + 1) c cycles a pixel, which pixels
+    average.
+    """
+    window = _sharp_window(geometry, superpixels, ring)
     fringes = (
         geometry.D2 * geometry.pixel_active / (geometry.wavelength * geometry.z3) * (window + 1)
     )

@@ -54,6 +54,23 @@ def test_a_sample_of_foreign_cameras_holds(count):
     assert sum(c.told for c in done) > 0.8 * len(done)
 
 
+@pytest.mark.parametrize("number", [70, 81])
+def test_rings_that_the_dial_leaves_out_are_told(number):
+    """A law of lenslets that touch said a tenth and a third of what they change; two rings more
+    than are taken stand for all.
+    """
+    camera = foreign.random_camera(np.random.default_rng((2, number, 9)))
+    plan = plan_pif(camera, model="fresnel", superpixels=(1, 1), accuracy=3e-2)
+    points, window = foreign.points_of(camera), plan.bands[0].window
+    some = sorted({0, camera.object.samples_per_lenslet[1] // 2, len(points) // 2})
+    lenslets = foreign.lenslets_of(camera, window + 2)
+    true = tensor.paraxial(camera, [points[n] for n in some], lenslets, [(0, 0)])
+    true = true.reshape(len(some), -1)
+    found = build_pif(camera, plan).A[0].reshape(true.shape[1], -1).T[some]
+    missed = np.linalg.norm(found - true, axis=1) / np.linalg.norm(true, axis=1)
+    assert 0.1 * plan.accuracy < missed.max() <= plan.accuracy
+
+
 @pytest.mark.parametrize("number", [1345, 1688, 1263])
 def test_what_edges_take_of_the_light_of_rays_is_told(number):
     """A law said 0.02 to 0.7 of it: points less than two diffraction cells within openings."""

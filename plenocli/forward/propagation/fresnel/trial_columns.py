@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import product, zip_longest
 from typing import TYPE_CHECKING
@@ -50,6 +50,8 @@ KEPT_VALUES = 1 << 20
 """Coefficients of light within pixels that a trial keeps, of one point at least."""
 OTHERS = 6.0
 """Columns tried from which on others are at most twice as bad, of few all the worse."""
+KEPT_CHANGES = 256
+"""Changes by a ring that are kept for the next plan of the same camera."""
 KEPT = 16
 """Trials that are kept for the next plan of the same camera."""
 
@@ -140,6 +142,17 @@ def cut_field(
     return _cut(Hashed(camera), geometry, half, tolerance)
 
 
+def change_by_ring(
+    camera: Camera, geometry: Geometry, window: int, symmetric: bool
+) -> float | None:
+    """Relative L2 change of the worst of a few columns of an own superpixel on the axis by one more
+    ring of coherent lenslets; None where that takes too long.
+
+    Parameters as those of trial_columns.
+    """
+    return _changed(Hashed(camera), replace(geometry, chief=(0.0, 0.0)), window, symmetric)
+
+
 class Hashed:
     """A camera with what its files hold, as a key."""
 
@@ -184,6 +197,19 @@ def _tried(
         if points and trial.values <= VALUES:
             whole = len(points) == len(trial.points) and trial.whole and near == window
             return trial.columns(hashed.camera, points, whole)
+    return None
+
+
+@lru_cache(maxsize=KEPT_CHANGES)
+def _changed(hashed: Hashed, geometry: Geometry, window: int, symmetric: bool) -> float | None:
+    for lines in (None, *THINNED):
+        less, more = (Trial(geometry, (1, 1), n, symmetric, 0, lines) for n in (window, window + 1))
+        count = min(FEW, int(AFFORDED / more.cost))
+        if count and more.values <= VALUES:
+            points = more.points[:count]
+            one, other = (t.columns(hashed.camera, points, False).pixels for t in (less, more))
+            change = np.linalg.norm(other - one, axis=1) / np.linalg.norm(other, axis=1)
+            return float(change.max())
     return None
 
 

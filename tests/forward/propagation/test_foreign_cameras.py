@@ -54,13 +54,13 @@ def test_a_sample_of_foreign_cameras_holds(count):
     assert sum(c.told for c in done) > 0.8 * len(done)
 
 
-@pytest.mark.parametrize("number", [70, 81])
-def test_rings_that_the_dial_leaves_out_are_told(number):
-    """A law of lenslets that touch said a tenth and a third of what they change; two rings more
-    than are taken stand for all.
+@pytest.mark.parametrize("number, asked", [(573, 3e-2), (573, 1e-2), (70, 5e-2)])
+def test_rings_that_the_dial_leaves_out_are_told(number, asked):
+    """Missed 1.9 to 5 times by a law of lenslets that touch; two rings more than are taken stand
+    for all.
     """
     camera = foreign.random_camera(np.random.default_rng((2, number, 9)))
-    plan = plan_pif(camera, model="fresnel", superpixels=(1, 1), accuracy=3e-2)
+    plan = plan_pif(camera, model="fresnel", superpixels=(1, 1), accuracy=asked)
     points, window = foreign.points_of(camera), plan.bands[0].window
     some = sorted({0, camera.object.samples_per_lenslet[1] // 2, len(points) // 2})
     lenslets = foreign.lenslets_of(camera, window + 2)
@@ -68,7 +68,7 @@ def test_rings_that_the_dial_leaves_out_are_told(number):
     true = true.reshape(len(some), -1)
     found = build_pif(camera, plan).A[0].reshape(true.shape[1], -1).T[some]
     missed = np.linalg.norm(found - true, axis=1) / np.linalg.norm(true, axis=1)
-    assert 0.1 * plan.accuracy < missed.max() <= plan.accuracy
+    assert 0.05 * asked < missed.max() <= asked
 
 
 @pytest.mark.parametrize("number", [1345, 1688, 1263])

@@ -72,6 +72,10 @@ SLOWER, BLURRED = (1.7, 1.3), 1.6
 """Factor, and power of the rings, by which light of far lenslets falls off more slowly where these
 do not touch; how much more is left out of focus.
 """
+CLOSE, CLOSE_AREA = 2.0, 0.6
+"""What the law says too little of other shapes that cover so much of their cells: squares with
+narrow gaps are another matter, since theirs cancel where they touch.
+"""
 UNTRIED_RING, LEAST_RING = 6.0, 0.5
 """How much more than the law a ring changes where that could not be tried, and at least."""
 BRIGHT = 0.25
@@ -111,6 +115,8 @@ def window_error(
     error = _law_of_windows(geometry, superpixels, ring)
     if touch(geometry):
         return error
+    if _are_close(geometry):
+        return min(1.0, CLOSE * error)
     nearest = coherent_window(geometry, (1, 1), 1) or 1
     changed = change_by_ring(camera, geometry, nearest, is_symmetric(camera))
     first = _law_of_windows(geometry, (1, 1), 1)
@@ -298,6 +304,15 @@ def _finer_aside(geometry: Geometry) -> float:
 def touch(geometry: Geometry) -> bool:
     """Whether lenslets are square and leave no gaps."""
     return geometry.lenslet_shape == "square" and geometry.lenslet_width >= TOUCHING * geometry.D2
+
+
+def _are_close(geometry: Geometry) -> bool:
+    """Whether lenslets other than squares on a square lattice cover most of their cells."""
+    shape, width = geometry.lenslet_shape, geometry.lenslet_width / geometry.D2
+    if (shape, geometry.lattice) == ("square", "square"):
+        return False
+    area = {"square": 1.0, "circle": math.pi / 4, "hexagon": math.sqrt(0.75)}[shape] * width**2
+    return area >= CLOSE_AREA * geometry.row_spacing
 
 
 def dimness(light: float) -> float:

@@ -138,13 +138,7 @@ def _border(camera: Camera, geometry: Geometry, joined: bool) -> tuple[float, fl
     _, *tilt = _affine(camera.main_lens, g)
     y, x = (np.abs(g.points(n) + g.z2 * tilt[n]) for n in (0, 1))
     half, in_cells = g.lenslet_width / 2, g.diffraction_cells / g.D2
-    if g.lenslet_shape == "square":
-        away = max(y.max(), x.max())
-    elif g.lenslet_shape == "circle":
-        away = np.hypot(y.max(), x.max())
-    else:
-        away = np.maximum(x, x / 2 + ROW_SPACING * y[:, None]).max()
-    border = float(half - away) * in_cells
+    border = float(half - _off_middle(g.lenslet_shape, y[:, None], x).max()) * in_cells
     if g.lenslet_shape == "square":
         sides = [((half - at.max()) * in_cells, (half + at.max()) * in_cells) for at in (y, x)]
     else:
@@ -157,6 +151,13 @@ def _border(camera: Camera, geometry: Geometry, joined: bool) -> tuple[float, fl
         own = 0.0 if joined else _taken(camera, [(part, part)] * 2)
         cut = max(cut / disc, own)
     return border, cut
+
+
+def _off_middle(shape: str, y: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Half the width of an opening of a shape on whose edge the places y, x (none negative) lie."""
+    if shape == "square":
+        return np.maximum(y, x)
+    return np.hypot(y, x) if shape == "circle" else np.maximum(x, ROW_SPACING * y + x / 2)
 
 
 def _taken(camera: Camera, sides: list[tuple[float, float]]) -> float:
@@ -287,11 +288,7 @@ class RayLenslets(LensletFields):
             np.abs(g.points(axis)[index] + g.z2 * self._tilt[axis] - at * g.D2)
             for axis, index, at in ((0, rows, m), (1, columns, n))
         )
-        far = (
-            np.hypot(y, x)
-            if g.lenslet_shape == "circle"
-            else np.maximum(x, math.sqrt(0.75) * y + x / 2)
-        )
+        far = _off_middle(g.lenslet_shape, y, x)
         return (far <= g.lenslet_width / 2)[:, None, None]
 
     def _light(self, y: np.ndarray, x: np.ndarray) -> np.ndarray:

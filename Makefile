@@ -66,7 +66,7 @@ extremes: $(READY) ## errors of the solvers against the condition of the matrix;
 	$(BIN)/python pipelines/benchmarks/extremes.py --run $(RUNS)/extremes
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto -m "" --campaign tests/inverse/test_extremes.py tests/faults/test_cameras.py
 
-honesty: $(READY) ## 2,000 random cameras of all shapes at random accuracies, and 300 lenslets off the axis, against sums that share no code with the models (40 minutes on 2 cores)
+honesty: $(READY) ## 2,000 random cameras of all shapes at random accuracies, 300 lenslets off the axis, and many neighbours, against sums that share no code with the models (40 minutes on 2 cores)
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist worksteal -m "" tests/forward/propagation/test_foreign_cameras.py
 
 faults: $(READY) ## the fault campaigns in full: 10,000 damaged files, 3,200 kills, full disks, power cuts, lack of memory, bombs (under an hour on 2 cores)

@@ -74,6 +74,15 @@ def kernel_values(camera, lenslets, superpixels):
     return len(superpixels) * lit * rule.lenslet_nodes**2 * on_sensor
 
 
+def paraxial_products(camera, lenslets, superpixels):
+    """Multiplications that `paraxial` takes for a point."""
+    rule = _Rule(camera, lenslets, superpixels, None, 1.0)
+    n, p = float(rule.lenslet_nodes), rule.pupil_nodes
+    rows, columns = (rule.pixel_nodes * count for count in camera.sensor.pixels_per_lenslet)
+    each = n * p * (n + p) + rows * n * (n + columns)
+    return len(superpixels) * len(lenslets) * each
+
+
 def _to_sensor(rule, v, u, y, x, fields):
     """Rayleigh and Sommerfeld's integral of fields at y, x: (point, v, u), without 1/wavelength."""
     count = len(fields)

@@ -19,6 +19,7 @@ from plenocli.forward.camera.field import at_field, pupil_change
 from plenocli.forward.camera.geometry import chief_ray, corner_ray, lenslet_shift
 from plenocli.forward.camera.geometry import geometry as geometry_of
 from plenocli.forward.propagation.bands import MAX_NODES, node_count, spectral_error, spectral_nodes
+from plenocli.forward.propagation.fresnel.left_out import window_error
 from plenocli.forward.propagation.fresnel.paraxial_error import oblique_error
 from plenocli.forward.propagation.models import MODELS
 from plenocli.forward.propagation.plan import Candidate, PifPlan
@@ -26,7 +27,6 @@ from plenocli.forward.propagation.sampling import (
     blur_ring,
     coherent_window,
     predicted_outside,
-    window_error,
 )
 from plenocli.forward.propagation.system_matrix import PifBuilder, build_pif
 

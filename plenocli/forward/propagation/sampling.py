@@ -21,7 +21,6 @@ from plenocli.forward.propagation.fresnel.spread_function import psf_nodes
 from plenocli.forward.propagation.fresnel.spread_terms import expected_terms
 from plenocli.forward.propagation.fresnel.trial_columns import (
     TrialColumns,
-    change_by_ring,
     cut_field,
     trial_columns,
 )
@@ -68,16 +67,6 @@ PSF_CUT_EFFECT = 0.3
 """
 TOUCHING = 0.999
 """Width of square lenslets over their pitch from which on no point lies in a gap."""
-SLOWER, BLURRED = (1.7, 1.3), 1.6
-"""Factor, and power of the rings, by which light of far lenslets falls off more slowly where these
-do not touch; how much more is left out of focus.
-"""
-CLOSE, CLOSE_AREA = 2.0, 0.6
-"""What the law says too little of other shapes that cover so much of their cells: squares with
-narrow gaps are another matter, since theirs cancel where they touch.
-"""
-UNTRIED_RING, LEAST_RING = 6.0, 0.5
-"""How much more than the law a ring changes where that could not be tried, and at least."""
 BRIGHT = 0.25
 """Light of the dimmest point of square lenslets that touch: a corner's, which four share."""
 UNTRIED, UNTRIED_WEIGHT = 1e-6, 3.0
@@ -96,63 +85,6 @@ NARROWING_LOSS = 2.0
 """Root energy that superpixels together may lose where each keeps only the terms that it needs,
 over the spread function's cut.
 """
-
-
-def window_error(
-    camera: Camera, geometry: Geometry, superpixels: tuple[int, int], ring: int
-) -> float:
-    """Estimated error because lenslets beyond the coherent window are left out: by a law, which is
-    that of square lenslets that touch. Of others what their second ring changes tells how much
-    larger it is, and it falls off more slowly.
-
-    superpixels: (rows, columns) kept;
-    ring: of coherent neighbours.
-
-    Returns the relative L2 error of a column; 0 where ring is 0 by choice.
-    """
-    if ring == 0:
-        return 0.0
-    error = _law_of_windows(geometry, superpixels, ring)
-    if touch(geometry):
-        return error
-    if _are_close(geometry):
-        return min(1.0, CLOSE * error)
-    nearest = coherent_window(geometry, (1, 1), 1) or 1
-    changed = change_by_ring(camera, geometry, nearest, is_symmetric(camera))
-    first = _law_of_windows(geometry, (1, 1), 1)
-    larger = UNTRIED_RING if changed is None else max(LEAST_RING, changed / first)
-    larger *= BLURRED if geometry.blur else 1.0
-    far = _sharp_window(geometry, superpixels, ring)
-    return min(1.0, SLOWER[0] * far ** SLOWER[1] * larger * error)
-
-
-def _sharp_window(geometry: Geometry, superpixels: tuple[int, int], ring: int) -> int:
-    """Lenslets on either side as a sharp point has them: light spread over several lenslets has no
-    sharp peak at a border, whose interference reaches furthest.
-    """
-    window, blur = coherent_window(geometry, superpixels, ring) or 0, blur_ring(geometry)
-    return window - blur + (blur > 0)
-
-
-def _law_of_windows(geometry: Geometry, superpixels: tuple[int, int], ring: int) -> float:
-    """window_error of square lenslets that touch, within a factor of 2 of brute force (N from 5.6
-    to 24 diffraction cells, c from 0.1 to 7.5, w from 1 to 6; worst point, docs/model.md).
-
-    Far lenslets interfere with the own one in fringes of (w + 1) c cycles a pixel, which pixels
-    average.
-    """
-    window = _sharp_window(geometry, superpixels, ring)
-    fringes = (
-        geometry.D2 * geometry.pixel_active / (geometry.wavelength * geometry.z3) * (window + 1)
-    )
-    scale = 0.075 if max(superpixels) == 1 else 0.12
-    return min(
-        1.0,
-        scale
-        * (window - 0.29) ** -2
-        * geometry.diffraction_cells**-1.09
-        * (1 + 3.5 * fringes) ** -1.34,
-    )
 
 
 def blur_ring(geometry: Geometry) -> int:
@@ -192,6 +124,11 @@ def coherent_window(geometry: Geometry, superpixels: tuple[int, int], ring: int)
         if ring == 0
         else max(math.ceil(max(geometry.reach(superpixels))), blur_ring(geometry)) + ring
     )
+
+
+def neighbour_fringes(geometry: Geometry) -> float:
+    """Cycles in a pixel of the fringes of a lenslet with the next."""
+    return geometry.D2 * geometry.pixel_active / (geometry.wavelength * geometry.z3)
 
 
 def _half_phase(geometry: Geometry, far: float) -> float:
@@ -255,20 +192,11 @@ def size_band(
             # a point at a corner lights two of them
             errors.append(math.sqrt(2) * pixel_error(*fewer, *light, BESIDE))
     else:
-        trial = tries(camera, geometry, superpixels, window, is_symmetric(camera))
-        alone = None
-        if trial is None and window is not None:
-            alone = tries(camera, geometry, superpixels, None, is_symmetric(camera))
-        tried = trial or alone
-        faintest = UNTRIED if tried is None else tried.faintest
+        tried, error = _beside_gaps(camera, geometry, superpixels, window, light, tries)
         # a point between lenslets is dim, and what is missed weighs more in its column
-        if tried is None:
-            weight, error = UNTRIED_WEIGHT, _fringes_beside_gaps(geometry, light)
-        else:
-            weight = tried.beyond
-            error = (
-                tried.error if trial else partial(_worse, tried.error, _untried(geometry, light))
-            )
+        faintest, weight = UNTRIED, UNTRIED_WEIGHT
+        if tried is not None:
+            faintest, weight = tried.faintest, tried.beyond
             cut_effect = TRIED_CUT_EFFECT * tolerance
         nodes, rule = _required(_fewest(error, accuracy / 1.5 / weight), joint)
         errors.append(weight * error(nodes, rule))
@@ -306,20 +234,35 @@ def touch(geometry: Geometry) -> bool:
     return geometry.lenslet_shape == "square" and geometry.lenslet_width >= TOUCHING * geometry.D2
 
 
-def _are_close(geometry: Geometry) -> bool:
-    """Whether lenslets other than squares on a square lattice cover most of their cells."""
-    shape, width = geometry.lenslet_shape, geometry.lenslet_width / geometry.D2
-    if (shape, geometry.lattice) == ("square", "square"):
-        return False
-    area = {"square": 1.0, "circle": math.pi / 4, "hexagon": math.sqrt(0.75)}[shape] * width**2
-    return area >= CLOSE_AREA * geometry.row_spacing
-
-
 def dimness(light: float) -> float:
     """Root of a point's light, over that of the dimmest of square lenslets that touch, at most 1:
     what is missed of the brightest weighs so much more in its column.
     """
     return min(1.0, math.sqrt(light / BRIGHT))
+
+
+def _beside_gaps(
+    camera: Camera,
+    geometry: Geometry,
+    superpixels: tuple[int, int],
+    window: int | None,
+    light: tuple[float, float, float, float],
+    tries: Tries,
+) -> tuple[TrialColumns | None, Callable[[int, int], float]]:
+    """(columns tried, None for none; what rules of a pixel's nodes miss) between lenslets that
+    leave gaps, or are round: by a law what could not be tried.
+    """
+    symmetric = is_symmetric(camera)
+    tried = tries(camera, geometry, superpixels, window, symmetric)
+    if tried is not None:
+        far = _fringes_beside_gaps(geometry, light)
+        return tried, tried.error if tried.reach(window) else partial(_worse, tried.error, far)
+    alone = None
+    if window is not None:
+        alone = tries(camera, geometry, superpixels, None, symmetric)
+    if alone is None:
+        return None, _fringes_beside_gaps(geometry, light)
+    return alone, partial(_worse, alone.error, _untried(geometry, light))
 
 
 def _fringes_beside_gaps(
@@ -337,7 +280,7 @@ def _untried(
     by side, or under one point's blur, may be all that a point between lenslets has.
     """
     own, joint, _, blur = light
-    beside = geometry.D2 * geometry.pixel_active / (geometry.wavelength * geometry.z3)
+    beside = neighbour_fringes(geometry)
     cycles = np.linspace(0, min(joint, own + max(1.0, blur) * beside), MANY)
     return partial(
         _worse,

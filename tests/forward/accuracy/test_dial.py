@@ -252,12 +252,12 @@ def test_long_work_is_announced_with_what_would_take_less(ladder, monkeypatch):
         == "about 60 s on one core (middle, error 0.001); --model ray takes 6 s at an error of 0.1"
     )
     assert expectation(plan_pif(camera, accuracy=2e-4), 3 << 30) == (
-        "about 3.3 min on one core and 3.00 GiB of memory (fine, error 0.0002); --model "
+        "about 3.3 min on one core and 3.00 GiB of memory (fine, error 0.0001); --model "
         "fresnel takes 20 s at an error of 0.001"
     )
     assert (
         expectation(plan_pif(camera, accuracy=2e-3, model="fresnel"), times=3)
-        == "about 60 s on one core (middle, error 0.0007)"
+        == "about 60 s on one core (middle, error 0.002)"
     )
 
 

@@ -17,9 +17,9 @@ from tests.forward.propagation.cameras import small_camera
 from tests.reference import tensor
 from tests.reference.oblique import oblique_columns
 
-AFFORDED, KERNEL_VALUES = 3e10, 3e9
-"""Multiplications of the paraxial oracle, and values of the exact one's kernel, beyond which a case
-is left out.
+AFFORDED, KERNEL_VALUES, RINGED = 3e10, 3e9, 3e9
+"""Multiplications of the paraxial oracle, values of the exact one's kernel, and multiplications for
+a point with many neighbours, beyond which a case is left out.
 """
 WIDEST = math.sqrt(0.75)
 """Opening over pitch from which squares on a hexagonal lattice, or hexagons on a square one, would
@@ -173,6 +173,30 @@ def oblique_case(seed, number):
     }
 
 
+def ringed_case(seed, number):
+    """A case of paraxial neighbours: rings that the dial takes by itself, or 2 to 6 of them;
+    (camera, request), None where lenslets have so many cells that more would tell little.
+    """
+    rng = np.random.default_rng((seed, number, 9))
+    camera = random_camera(rng)
+    if cells_of(camera) > 12:
+        return None
+    accuracy, across = float(10.0 ** -rng.uniform(0.7, 4)), 3 if rng.uniform() < 0.25 else 1
+    return camera, {
+        "model": "fresnel",
+        "superpixels": (across, across),
+        "coherent_ring": "auto" if rng.uniform() < 0.75 else int(rng.integers(2, 7)),
+        "accuracy": accuracy,
+    }
+
+
+def cells_of(camera):
+    """Diffraction cells of a lenslet."""
+    lens, array = camera.main_lens, camera.lenslet_array
+    (wavelength,) = camera.light.wavelengths
+    return array.pitch * lens.aperture_diameter / wavelength / array.distance
+
+
 def is_centred(seed, number):
     """Whether the case of auto is one of harmonics: isolated, round or hexagonal, on the axis."""
     camera, request = case(seed, number, "auto")
@@ -247,8 +271,7 @@ def oblique_answer(seed, number):
     some = sorted({0, columns - 1, (rows - 1) * columns, rows * columns - 1})
 
     def truth(plan):
-        cells = array.pitch * camera.main_lens.aperture_diameter / array.distance
-        cells *= 1 / camera.light.wavelengths[0]
+        cells = cells_of(camera)
         if plan.rung == "rays" or cells > 40 or cells * max(camera.sensor.pixels_per_lenslet) > 400:
             return None
         return oblique_columns(
@@ -259,6 +282,29 @@ def oblique_answer(seed, number):
             shift=lenslet_shift(camera, row, column)[2],
             pixel_nodes=plan.bands[0].pixel_nodes + 8,
         )
+
+    return _judged(number, camera, request, truth, some)
+
+
+def ringed_answer(seed, number):
+    """As `answer`, of a ringed_case: three points at most; two rings more than the dial takes stand
+    for all lenslets.
+    """
+    found = ringed_case(seed, number)
+    if found is None:
+        return None
+    camera, request = found
+    points, across = points_of(camera), camera.object.samples_per_lenslet[1]
+    some = sorted({0, across // 2, len(points) // 2})
+
+    def truth(plan):
+        window, reach = plan.bands[0].window, (plan.superpixels[0] - 1) // 2
+        lenslets = lenslets_of(camera, window + 2 * (request["coherent_ring"] == "auto"))
+        far = range(-reach, reach + 1)
+        superpixels = [(r, c) for r in far for c in far]
+        if tensor.paraxial_products(camera, lenslets, superpixels) > RINGED:
+            return None
+        return tensor.paraxial(camera, [points[n] for n in some], lenslets, superpixels)
 
     return _judged(number, camera, request, truth, some)
 
@@ -306,11 +352,10 @@ def describe(camera, request):
     """One line about a case."""
     lens, array, sensor = camera.main_lens, camera.lenslet_array, camera.sensor
     eps = 1 / camera.object.distance + 1 / array.distance - 1 / lens.focal_length
-    cells = array.pitch * lens.aperture_diameter / camera.light.wavelengths[0] / array.distance
     return (
         f"{array.aperture_shape}/{array.lattice} fill {array.fill_factor:.2f}, "
         f"{lens.aperture_shape} f/{array.distance / lens.aperture_diameter:.1f} lenslet f/"
-        f"{array.focal_length / array.pitch:.1f}, {cells:.0f} cells, blur "
+        f"{array.focal_length / array.pitch:.1f}, {cells_of(camera):.0f} cells, blur "
         f"{eps * lens.aperture_diameter * array.distance / array.pitch:.1f}, terms "
         f"{[t.noll for t in lens.aberrations or ()]}, pixels {sensor.pixels_per_lenslet}, "
         f"{request['superpixels']} ring {request['coherent_ring']} "

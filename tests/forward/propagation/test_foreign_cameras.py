@@ -22,17 +22,21 @@ OBLIQUE, OBLIQUE_PARTS = 8, 6
 """The same of lenslets off the axis: 300 in all."""
 COARSE, COARSE_PARTS = (0.2, 1.3), 4
 """Accuracies of coarse answers, as powers of a tenth, and their parts: 200 in all."""
+RINGED, RINGED_PARTS = 60, 6
+"""Draws of a part of cameras of few cells with many neighbours, of which a fifth is asked, and its
+parts.
+"""
 CENTRED, CENTRED_PARTS = (342, 442), 20
 """Of seed 41, two cameras whose lenslets are round or hexagonal, isolated and on the axis, of few
 fringes; parts of a campaign that looks for such.
 """
 
 
-def summed(cases, count):
+def summed(cases, count, what="foreign cameras"):
     """Count and check cases: all hold or are refused with a number."""
     done = [c for c in cases if c.true is not None]
     count(
-        "foreign cameras",
+        what,
         asked=len(cases),
         refused=len(cases) - len(done),
         held=sum(c.ratio <= 1 for c in done),
@@ -69,6 +73,15 @@ def test_rings_that_the_dial_leaves_out_are_told(number, asked):
     found = build_pif(camera, plan).A[0].reshape(true.shape[1], -1).T[some]
     missed = np.linalg.norm(found - true, axis=1) / np.linalg.norm(true, axis=1)
     assert 0.05 * asked < missed.max() <= asked
+
+
+@pytest.mark.parametrize("case", [(1, 215), (5, 98), (5, 103)])
+def test_fringes_of_far_lenslets_are_sampled(case):
+    """Missed up to 1.65 times, and up to five where rings were chosen otherwise: nodes of a pixel
+    were those for fringes of lenslets near by, whatever the window.
+    """
+    found = foreign.ringed_answer(*case)
+    assert found.ratio <= 1 and found.true <= 1.2 * found.said
 
 
 @pytest.mark.parametrize("number", [1345, 1688, 1263])
@@ -199,6 +212,14 @@ def test_coarse_answers_hold(part, count):
     numbers = range(part * PART, (part + 1) * PART)
     cases = (foreign.answer(51, n, "auto", COARSE, 1e9) for n in numbers)
     summed([c for c in cases if c], count)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("part", range(RINGED_PARTS))
+def test_many_neighbours_hold(part, count):
+    numbers = range(part * RINGED, (part + 1) * RINGED)
+    cases = [c for c in (foreign.ringed_answer(8, n) for n in numbers) if c]
+    assert len(summed(cases, count, "cameras with many neighbours")) >= 4
 
 
 @pytest.mark.slow

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
@@ -113,7 +113,9 @@ def exact_trial_columns(
     if window == joined and exact and exact.whole:
         return exact
     paraxial = trial_columns(camera, geometry, grid, window, symmetric)
-    return _Both(**vars(paraxial), exact=exact) if paraxial and exact else paraxial
+    if paraxial is None or exact is None:
+        return paraxial
+    return replace(paraxial, others=(*paraxial.others, exact))
 
 
 def _join_quickly(
@@ -122,14 +124,3 @@ def _join_quickly(
     """Whether all columns are tried with their neighbours in little time."""
     trial = ExactTrial(geometry, grid, window, symmetric, 1, None)
     return trial.whole and trial.cost * len(trial.points) <= CHEAP
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Both(TrialColumns):
-    """Columns by the paraxial model, beside some by the exact one of isolated lenslets."""
-
-    exact: TrialColumns
-
-    def error(self, count: int, rule: int) -> float:
-        """As of TrialColumns, the larger of both."""
-        return max(super().error(count, rule), self.exact.error(count, rule))

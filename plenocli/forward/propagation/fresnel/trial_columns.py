@@ -37,7 +37,9 @@ Point = tuple[int, int]
 CHEAP, AFFORDED = 3e8, 9e8
 """Complex multiplications that a trial may take, and one of few points or of all."""
 NEAR = 2
-"""Rings of lenslets around those under a point's blur whose fields are tried together."""
+"""Rings of lenslets around those under a point's blur whose fields are tried together by most
+columns.
+"""
 FEW, LINES = 4, 8
 """Points of a symmetric pupil that a trial should have, and the most lines of points per axis."""
 VALUES = 1 << 22
@@ -50,8 +52,6 @@ KEPT_VALUES = 1 << 20
 """Coefficients of light within pixels that a trial keeps, of one point at least."""
 OTHERS = 6.0
 """Columns tried from which on others are at most twice as bad, of few all the worse."""
-KEPT_CHANGES = 256
-"""Changes by a ring that are kept for the next plan of the same camera."""
 KEPT = 16
 """Trials that are kept for the next plan of the same camera."""
 
@@ -67,7 +67,9 @@ class TrialColumns:
         column's norm;
     pixels: (column, pixel) light of each pixel looked at, as a share of the point's;
     whole: whether they are all columns that symmetry does not give, with all their lenslets and
-        pixels.
+        pixels;
+    window: coherent lenslets on either side, None for isolated ones;
+    others: columns tried otherwise, which rules of nodes have to serve as well.
     """
 
     light: np.ndarray
@@ -75,6 +77,8 @@ class TrialColumns:
     light_within: np.ndarray
     pixels: np.ndarray
     whole: bool
+    window: int | None
+    others: tuple[TrialColumns, ...] = ()
 
     @property
     def faintest(self) -> float:
@@ -98,7 +102,12 @@ class TrialColumns:
         missed = found - true
         by_axes = np.sqrt(np.maximum(missed @ self.fringes @ missed, 0).max())
         together = np.tensordot(self.light_within, np.outer(found, found) - np.outer(true, true))
-        return float(max(by_axes, np.linalg.norm(together, axis=1).max()))
+        beside = (other.error(count, rule) for other in self.others)
+        return float(max(by_axes, np.linalg.norm(together, axis=1).max(), *beside))
+
+    def reach(self, window: int | None) -> bool:
+        """Whether some were tried with the light of all lenslets of a window."""
+        return any(columns.window == window for columns in (self, *self.others))
 
 
 def trial_columns(
@@ -109,7 +118,9 @@ def trial_columns(
     symmetric: bool,
     kind: Callable[..., Trial] | None = None,
 ) -> TrialColumns | None:
-    """The TrialColumns of a camera, None where they would take too long.
+    """The TrialColumns of a camera, None where they would take too long: of lenslets near the
+    object's, which have nearly all light, and beside them of as many as can be tried in time, whose
+    fringes are the finest.
 
     camera: at the wavelength of `geometry`;
     grid: (rows, columns) of superpixels kept;
@@ -117,8 +128,12 @@ def trial_columns(
     symmetric: whether pupil and wavefront are mirrored by both axes;
     kind: of trial; None: by the paraxial model.
     """
-    near = near_window(geometry, window)
-    return _tried(kind or Trial, Hashed(camera), geometry, grid, near, symmetric)
+    near, kind, hashed = near_window(geometry, window), kind or Trial, Hashed(camera)
+    columns = _tried(kind, hashed, geometry, grid, near, symmetric, 1)
+    if columns is None or near is None or near == window:
+        return columns
+    far = _tried(kind, hashed, geometry, grid, window, symmetric, near + 1)
+    return columns if far is None else replace(columns, others=(far,))
 
 
 def near_window(geometry: Geometry, window: int | None) -> int | None:
@@ -140,17 +155,6 @@ def cut_field(
     if psf_nodes(geometry, half) > QUICK:
         return None
     return _cut(Hashed(camera), geometry, half, tolerance)
-
-
-def change_by_ring(
-    camera: Camera, geometry: Geometry, window: int, symmetric: bool
-) -> float | None:
-    """Relative L2 change of the worst of a few columns of an own superpixel on the axis by one more
-    ring of coherent lenslets; None where that takes too long.
-
-    Parameters as those of trial_columns.
-    """
-    return _changed(Hashed(camera), replace(geometry, chief=(0.0, 0.0)), window, symmetric)
 
 
 class Hashed:
@@ -186,30 +190,18 @@ def _tried(
     grid: tuple[int, int],
     window: int | None,
     symmetric: bool,
+    least: int,
 ) -> TrialColumns | None:
-    # fewer pixels, superpixels and lenslets where that is too much
-    lenslets = [None] if window is None else range(window, 0, -1)
+    # fewer pixels, superpixels and lenslets, at least `least`, where that is too much
+    lenslets = [None] if window is None else range(window, least - 1, -1)
     for near, beside, lines in product(lenslets, (1, 0), (None, *THINNED)):
         trial = kind(geometry, grid, near, symmetric, beside, lines)
         every = len(trial.points) * trial.cost <= AFFORDED
-        least = len(trial.points) if every else min(int(AFFORDED / trial.cost), trial.least)
-        points = trial.points[: max(int(CHEAP / trial.cost), least)]
+        few = len(trial.points) if every else min(int(AFFORDED / trial.cost), trial.least)
+        points = trial.points[: max(int(CHEAP / trial.cost), few)]
         if points and trial.values <= VALUES:
             whole = len(points) == len(trial.points) and trial.whole and near == window
             return trial.columns(hashed.camera, points, whole)
-    return None
-
-
-@lru_cache(maxsize=KEPT_CHANGES)
-def _changed(hashed: Hashed, geometry: Geometry, window: int, symmetric: bool) -> float | None:
-    for lines in (None, *THINNED):
-        less, more = (Trial(geometry, (1, 1), n, symmetric, 0, lines) for n in (window, window + 1))
-        count = min(FEW, int(AFFORDED / more.cost))
-        if count and more.values <= VALUES:
-            points = more.points[:count]
-            one, other = (t.columns(hashed.camera, points, False).pixels for t in (less, more))
-            change = np.linalg.norm(other - one, axis=1) / np.linalg.norm(other, axis=1)
-            return float(change.max())
     return None
 
 
@@ -355,6 +347,7 @@ class Trial:
             light_within=inside,
             pixels=seen,
             whole=whole,
+            window=self.window,
         )
 
     def fields(

@@ -276,14 +276,14 @@ def _consider(request: _Request, model: Model) -> Candidate:
         return Candidate(name=model.name, model=model.kind, why=reason)
     tried = []
     for ring in _rings_of(request, model):
-        outside = 0.0 if model.kind == "ray" else _left_out(request, ring)
         # the rings that a user asks for are the user's model
+        chosen = model.kind != "ray" and len(request.rings) > 1
         nodes, spectrum = _band_nodes(request, model, ring)
         split = {
             "model": 0.0 if request.model != "auto" else _error_bound(request, model, ring),
             "storage": 3e-8 if request.dtype == np.float32 else 0.0,
             "spectrum": math.hypot(spectrum, request.dim),
-            "neighbourhood": outside if len(request.rings) > 1 else 0.0,
+            "neighbourhood": _left_out(request, ring) if chosen else 0.0,
         }
         tried.append(_sized(request, model, ring, split, nodes))
         if tried[-1].why is None:
@@ -535,8 +535,8 @@ def _plan(request: _Request, found: list[Candidate], best: Candidate) -> PifPlan
         for c in found
     )
     warnings = [*request.warnings, *_warnings(request, best)]
-    window = _left_out(request, best.ring)
     if best.ring and best.model != "ray":
+        window = _left_out(request, best.ring)
         request.left_out.append(
             f"lenslets beyond {best.ring} ring(s) of coherent neighbours: error about {window:.1g}"
         )

@@ -124,6 +124,12 @@ class Geometry:
         return self.D1 * self.z2 * abs(self.eps) if self.ray_reach is None else 2 * self.ray_reach
 
     @property
+    def opening_area(self) -> float:
+        """Of a lenslet's opening, m^2."""
+        share = {"square": 1.0, "circle": math.pi / 4, "hexagon": math.sqrt(3) / 2}
+        return share[self.lenslet_shape] * self.lenslet_width**2
+
+    @property
     def row_spacing(self) -> float:
         """Distance of neighbouring rows of lenslets, in pitches."""
         return ROW_SPACING if self.lattice == "hexagonal" else 1.0

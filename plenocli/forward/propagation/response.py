@@ -370,14 +370,14 @@ def _opening_nodes(geometry: Geometry) -> list[tuple[float, float, float]]:
     high, wide = geometry.lenslet_extent
     spread = abs(geometry.z3 * geometry.kappa) * geometry.lenslet_width / geometry.pixel_pitch
     if spread < 1e-6:
-        return [(0.0, 0.0, _opening_area(geometry))]
+        return [(0.0, 0.0, geometry.opening_area)]
     t, w = gauss(min(64, math.ceil(OPENING_STEPS * spread) + 4))
     nodes = []
     for y, wy in zip(high * t, high * w):
         far = _opening_half(geometry, y)
         nodes += [(y, far * s, wy * far * ws) for s, ws in zip(t, w)]
     # few nodes place the light well enough, but do not sum to a round opening
-    scale = _opening_area(geometry) / sum(weight for *_, weight in nodes)
+    scale = geometry.opening_area / sum(weight for *_, weight in nodes)
     return [(y, x, weight * scale) for y, x, weight in nodes]
 
 
@@ -389,8 +389,3 @@ def _opening_half(geometry: Geometry, y: float) -> float:
     if geometry.lenslet_shape == "circle":
         return math.sqrt(max(half * half - y * y, 0.0))
     return min(half, 2 * half - math.sqrt(3) * abs(y))
-
-
-def _opening_area(geometry: Geometry) -> float:
-    side = {"square": 1.0, "circle": math.pi / 4, "hexagon": math.sqrt(3) / 2}
-    return side[geometry.lenslet_shape] * geometry.lenslet_width**2

@@ -240,6 +240,18 @@ def points_of(camera):
     ]
 
 
+def few_points(camera):
+    """Which of points_of a sum over many lenslets looks at: a corner's, an edge's, one within."""
+    rows, columns = camera.object.samples_per_lenslet
+    return sorted({0, columns // 2, rows * columns // 2})
+
+
+def superpixels_of(plan):
+    """(row, column) of the superpixels kept, from the middle."""
+    down, across = (range(-(n // 2), n // 2 + 1) for n in plan.superpixels)
+    return [(r, c) for r in down for c in across]
+
+
 def answer(seed, number, model=None, finer=(1, 7), most=KERNEL_VALUES):
     """The Case, None where the exact oracle would take more than `most` values, or the paraxial one
     too long.
@@ -247,10 +259,7 @@ def answer(seed, number, model=None, finer=(1, 7), most=KERNEL_VALUES):
     camera, request = case(seed, number, model, finer)
 
     def truth(plan):
-        window, reach = plan.bands[0].window, [(n - 1) // 2 for n in plan.superpixels]
-        superpixels = [
-            (r, c) for r in range(-reach[0], reach[0] + 1) for c in range(-reach[1], reach[1] + 1)
-        ]
+        window, superpixels = plan.bands[0].window, superpixels_of(plan)
         lenslets = None if window is None else lenslets_of(camera, window)
         if request["model"] == "fresnel":
             dear, oracle = _work(camera, plan) > AFFORDED, tensor.paraxial
@@ -294,14 +303,11 @@ def ringed_answer(seed, number):
     if found is None:
         return None
     camera, request = found
-    points, across = points_of(camera), camera.object.samples_per_lenslet[1]
-    some = sorted({0, across // 2, len(points) // 2})
+    points, some = points_of(camera), few_points(camera)
 
     def truth(plan):
-        window, reach = plan.bands[0].window, (plan.superpixels[0] - 1) // 2
+        window, superpixels = plan.bands[0].window, superpixels_of(plan)
         lenslets = lenslets_of(camera, window + 2 * (request["coherent_ring"] == "auto"))
-        far = range(-reach, reach + 1)
-        superpixels = [(r, c) for r in far for c in far]
         if tensor.paraxial_products(camera, lenslets, superpixels) > RINGED:
             return None
         return tensor.paraxial(camera, [points[n] for n in some], lenslets, superpixels)

@@ -69,7 +69,7 @@ def window_error(
     if ring == 0:
         return 0.0
     straight = 1.0 if camera.main_lens.aperture_shape in ("circle", "annulus") else STRAIGHT
-    if _area(geometry) >= CLOSE_AREA:
+    if geometry.opening_area >= CLOSE_AREA * geometry.D2**2 * geometry.row_spacing:
         least, more, most = CLOSE
         close = min(most, least + more / geometry.diffraction_cells)
         return min(1.0, close * straight * _law_of_windows(geometry, superpixels, ring))
@@ -86,16 +86,16 @@ def window_error(
     return min(1.0, beyond * aside * kept * _fall(geometry, window))
 
 
-def _area(geometry: Geometry) -> float:
-    """Share of their cells that lenslets cover."""
-    width = geometry.lenslet_width / geometry.D2
-    area = {"square": 1.0, "circle": math.pi / 4, "hexagon": math.sqrt(0.75)}
-    return area[geometry.lenslet_shape] * width**2 / geometry.row_spacing
-
-
 def _fall(geometry: Geometry, window: int) -> float:
     """How the light of lenslets beyond a window falls off at least, up to a factor."""
-    return window**-2 / math.sqrt(1 + 3.5 * neighbour_fringes(geometry) * (window + 1))
+    return window**-2 / math.sqrt(_averaging(geometry, window))
+
+
+def _averaging(geometry: Geometry, window: int) -> float:
+    """What grows with the cycles (w + 1) c a pixel of the fringes in which far lenslets interfere
+    with the own one, and which pixels average.
+    """
+    return 1 + 3.5 * neighbour_fringes(geometry) * (window + 1)
 
 
 @lru_cache(maxsize=KEPT_CHANGES)
@@ -132,17 +132,13 @@ def _sharp_window(geometry: Geometry, superpixels: tuple[int, int], ring: int) -
 def _law_of_windows(geometry: Geometry, superpixels: tuple[int, int], ring: int) -> float:
     """window_error of square lenslets that touch, within a factor of 2 of brute force (N from 5.6
     to 24 diffraction cells, c from 0.1 to 7.5, w from 1 to 6; worst point, docs/model.md).
-
-    Far lenslets interfere with the own one in fringes of (w + 1) c cycles a pixel, which pixels
-    average.
     """
     window = _sharp_window(geometry, superpixels, ring)
-    fringes = neighbour_fringes(geometry) * (window + 1)
     scale = 0.075 if max(superpixels) == 1 else 0.12
     return min(
         1.0,
         scale
         * (window - 0.29) ** -2
         * geometry.diffraction_cells**-1.09
-        * (1 + 3.5 * fringes) ** -1.34,
+        * _averaging(geometry, window) ** -1.34,
     )

@@ -48,7 +48,7 @@ def model_code(name: str, root: Path) -> str:
 
 def modules_of(name: str, root: Path) -> list[str]:
     """Names of the modules that compute the model `name`, in alphabetical order."""
-    found, todo = set(), [model_named(name).lenslets.__module__, BUILDER]
+    found, todo = set(), [model_named(name).lenslets.module, BUILDER]
     while todo:
         module = todo.pop()
         path = None if module in found or module == TABLE else path_of(module, root)

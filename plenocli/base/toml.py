@@ -2,7 +2,6 @@
 nearest known key.
 """
 
-import difflib
 import re
 import tomllib
 from collections import Counter
@@ -89,6 +88,8 @@ def _sentence(error: Any, model: type[BaseModel]) -> str:
     """
     path = [str(p) for p in error["loc"]]
     if error["type"] == "extra_forbidden":
+        import difflib
+
         known = known_keys(path[:-1], model)
         near = difflib.get_close_matches(path[-1], known, 1, 0.5)
         hint = f"did you mean {near[0]}?" if near else f"known here: {', '.join(known)}"

@@ -2,7 +2,6 @@
 errors become exit codes.
 """
 
-import difflib
 import errno
 import gc
 import io
@@ -41,6 +40,8 @@ class Pipeline(click.Group):
     ) -> tuple[str | None, click.Command | None, list[str]]:
         """As click does; a misspelt name is answered with the nearest one."""
         if args and args[0] not in COMMANDS and not args[0].startswith("-"):
+            import difflib
+
             near = difflib.get_close_matches(args[0], COMMANDS, 1)
             hint = f"Did you mean {near[0]}?" if near else f"Choose one of {', '.join(COMMANDS)}."
             raise click.UsageError(f"No such command {args[0]!r}. {hint}", ctx)
@@ -117,7 +118,7 @@ def main(argv: list[str] | None = None) -> None:
 def run(argv: list[str] | None = None) -> int:
     """Run the command line with `argv` (default: the process's own) and return the exit code."""
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")  # to look for them takes 10 ms
-    gc.set_threshold(10_000)  # imports leave no garbage; looking is a twentieth of a start
+    gc.set_threshold(100_000)  # imports leave no garbage; looking is a twentieth of a start
     debug = os.environ.get("PLENOCLI_DEBUG", "") not in ("", "0")
     stdout = sys.stdout
     try:

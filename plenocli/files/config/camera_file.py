@@ -1,14 +1,24 @@
 """The camera's description as TOML, both ways."""
 
 import os
+import re
 from pathlib import Path
 from typing import Any
 
 from plenocli.base.toml import parse_toml
 from plenocli.base.units import format_duration, format_length
-from plenocli.files.config.curve_file import read_curve
 from plenocli.files.config.toml_file import read_text
 from plenocli.forward.camera.model import Camera
+
+_OBJECTIVE = re.compile(r"^\s*\[\s*objective\s*\]", re.MULTILINE)
+
+
+def describes_microscope(path: str | os.PathLike[str]) -> bool:
+    """Whether a description has an [objective], as a microscope's has.
+
+    Raises InputError where the file cannot be read.
+    """
+    return _OBJECTIVE.search(read_text(Path(path), "camera")) is not None
 
 
 def load_camera(path: str | os.PathLike[str]) -> Camera:
@@ -33,12 +43,15 @@ def with_curves(data: dict[str, Any], folder: Path) -> dict[str, Any]:
 
     Raises InputError for a file that holds no curve, or no drawing.
     """
+    section = data.get("filter_array")
+    if not isinstance(section, dict):
+        return data
+    from plenocli.files.config.curve_file import read_curve
     from plenocli.files.images.maps import read_drawing
 
-    section = data.get("filter_array")
-    if isinstance(section, dict) and isinstance(section.get("drawing"), str):
+    if isinstance(section.get("drawing"), str):
         section["drawing"] = read_drawing(folder / section["drawing"])
-    filters = section.get("filters") if isinstance(section, dict) else None
+    filters = section.get("filters")
     for one in filters if isinstance(filters, list) else ():
         if isinstance(one, dict) and isinstance(one.get("curve"), str):
             one["curve"] = read_curve(folder / one["curve"])

@@ -1,7 +1,6 @@
 """The description of a light-field microscope as TOML, both ways."""
 
 import os
-import re
 from pathlib import Path
 
 from plenocli.base.toml import parse_toml
@@ -9,16 +8,6 @@ from plenocli.files.config.camera_file import section_lines, to_toml
 from plenocli.files.config.toml_file import read_text
 from plenocli.forward.camera.microscope import Microscope
 from plenocli.forward.camera.model import Camera
-
-_OBJECTIVE = re.compile(r"^\s*\[\s*objective\s*\]", re.MULTILINE)
-
-
-def describes_microscope(path: str | os.PathLike[str]) -> bool:
-    """Whether a description has an [objective], as a microscope's has.
-
-    Raises InputError where the file cannot be read.
-    """
-    return _OBJECTIVE.search(read_text(Path(path), "camera")) is not None
 
 
 def load_microscope(path: str | os.PathLike[str]) -> Microscope:

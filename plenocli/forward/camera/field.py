@@ -8,7 +8,6 @@ centres lie on the axis of a. docs/model.md, "Fields that change over the field"
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,19 +17,8 @@ import numpy as np
 
 from plenocli.base.errors import ConfigError, NumericsError
 from plenocli.base.units import format_length
-from plenocli.forward.camera.lens import (
-    CameraLens,
-    camera_lens,
-    chief_height,
-    disc_points,
-    first_order,
-    paraxial_image,
-    wavefront,
-)
-from plenocli.forward.camera.prescription import Prescription
-from plenocli.forward.camera.pupil import aperture_picture, unit_radius, zernike
+from plenocli.forward.camera.pupil import RIM, aperture_picture, unit_radius
 from plenocli.forward.camera.pupil import wavefront as wavefront_error
-from plenocli.forward.camera.raytrace import Rays, aim, entrance_pupil, trace
 from plenocli.forward.camera.sections.main_lens import noll_indices
 
 if TYPE_CHECKING:
@@ -38,12 +26,8 @@ if TYPE_CHECKING:
     from plenocli.forward.camera.sections.main_lens import FieldRow, MainLens
 
 ON_AXIS: tuple[float, float] = (0.0, 0.0)
-TERMS = 66
-"""Noll terms, of which the cosine ones describe a traced wavefront off the axis."""
 CHANGE_NODES = 64
 """Points of the pupil along an axis that tell how much it changes."""
-CUT = 1e-4
-"""Share of the pupil's radius that a rim must reach into it to count."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,7 +64,9 @@ def at_field(camera: Camera, wavelength: float, chief: tuple[float, float] = ON_
     height, unit = math.hypot(*chief), unit_radius(thin)
     seen = _of_rows(thin.field, height, unit, thin.focal_length)
     if thin.prescription is not None:
-        traced = _traced(
+        from plenocli.forward.camera.lens import traced_lens
+
+        focal_length, terms, rims = traced_lens(
             thin.samples("prescription"),
             camera.object.distance,
             2 * unit,
@@ -89,11 +75,7 @@ def at_field(camera: Camera, wavelength: float, chief: tuple[float, float] = ON_
             thin.focal_length,
             height / camera.lenslet_array.distance,
         )
-        seen = _Seen(
-            focal_length=traced.focal_length,
-            terms=seen.terms + traced.terms,
-            rims=seen.rims + traced.rims,
-        )
+        seen = _Seen(focal_length=focal_length, terms=seen.terms + terms, rims=seen.rims + rims)
     if seen.rims and thin.aperture_shape == "image":
         raise ConfigError(
             "rims cut the pupil off the axis, which an aperture image cannot have",
@@ -200,7 +182,7 @@ def _of_rows(rows: Sequence[FieldRow], height: float, unit: float, focal_length:
     return _Seen(
         focal_length=focal_length,
         terms=tuple((j, c) for j, c in terms if c),
-        rims=((-shift * unit, unit),) if shift > CUT else (),
+        rims=((-shift * unit, unit),) if shift > RIM else (),
     )
 
 
@@ -215,137 +197,3 @@ def overlap(shift: float) -> float:
     """Share of its area in which a disc of radius 1 overlaps one that stands `shift` aside."""
     half = shift / 2
     return 2 / math.pi * (math.acos(half) - half * math.sqrt(1 - half * half))
-
-
-# a traced lens
-
-
-@functools.lru_cache(maxsize=1024)
-def _traced(
-    lens: Prescription,
-    object_distance: float,
-    aperture_diameter: float,
-    design_wavelength: float,
-    wavelength: float,
-    nominal: float,
-    slope: float,
-) -> _Seen:
-    """What a prescription is to a camera whose description gives it the focal length `nominal` (m).
-
-    slope: of the lenslet's chief ray, tangent of the angle behind the rear principal point.
-    """
-    inside = camera_lens(lens, object_distance, aperture_diameter, design_wavelength)
-    own = first_order(lens, design_wavelength).focal_length
-    if abs(own / nominal - 1) > 0.02:
-        raise ConfigError(
-            (
-                f"the lens file has a focal length of {own * 1e3:.5g} mm at "
-                f"{design_wavelength * 1e9:.4g} nm, the camera says {nominal * 1e3:.5g} mm"
-            ),
-            "main_lens.focal_length",
-            "write the lens's own, or scale the lens: plenocli lens import --focal-length",
-        )
-    focal_length = inside.focal_length(wavelength)
-    terms, rims = _off_axis(inside, wavelength, slope)
-    if slope == 0:
-        terms = inside.aberrations(wavelength)
-    return _Seen(focal_length=focal_length, terms=terms, rims=rims)
-
-
-def _off_axis(
-    inside: CameraLens, wavelength: float, slope: float
-) -> tuple[tuple[tuple[int, float], ...], tuple[tuple[float, float], ...]]:
-    """(Noll terms, rims) of a traced lens off the axis; arguments as _traced and _field_angle."""
-    points, weights = disc_points(24, 48)
-    angle = _field_angle(inside, wavelength, slope)
-    wave = wavefront(
-        inside.lens,
-        wavelength,
-        points,
-        angle,
-        inside.object_distance,
-        paraxial_image(inside.lens, wavelength, inside.object_distance),
-        clip=False,
-    )
-    place, radius = inside.pupil_places(wave.cosines, wavelength, slope), inside.radius
-    cosine = [j for j in range(2, TERMS + 1) if noll_indices(j)[1] >= 0]
-    lit = np.isfinite(wave.error)
-    if lit.sum() < 4 * len(cosine):
-        raise NumericsError(
-            f"{int(lit.sum())} rays get through the lens {math.degrees(angle):.3g} degrees off the "
-            "axis, too few to know its wavefront",
-            "main_lens.prescription",
-            "use a smaller array",
-        )
-    a, b = place[:, lit] / radius
-    root = np.sqrt(weights[lit])
-    basis = np.stack([np.ones(a.shape), *(zernike(j, b, a) for j in cosine)], axis=1)
-    found = np.linalg.lstsq(basis * root[:, None], wave.error[lit] * root, rcond=1e-10)[0][1:]
-    start = aim(
-        inside.lens, wavelength, points, angle=angle, object_distance=inside.object_distance
-    )
-    rims = _rims(inside.lens, wavelength, start, points, place / radius, angle)
-    terms = tuple((j, float(c)) for j, c in zip(cosine, found))
-    return terms, tuple((centre * radius, size * radius) for centre, size in rims)
-
-
-def _field_angle(inside: CameraLens, wavelength: float, slope: float) -> float:
-    """The field angle (rad) whose chief ray meets the image plane where a straight line of that
-    slope from the rear principal point does, distortion included.
-    """
-    lens = inside.lens
-    before = inside.object_distance + entrance_pupil(lens, lens.design_wavelength).position
-    tangent, height = slope * inside.z1 / before, slope * inside.z2
-    image = paraxial_image(lens, lens.design_wavelength, inside.object_distance)
-    for _ in range(8 if slope else 0):
-        found = chief_height(lens, wavelength, math.atan(tangent), inside.object_distance, image)
-        tangent *= height / found
-        if abs(found / height - 1) < 1e-6:
-            break
-    return math.atan(tangent)
-
-
-def _rims(
-    lens: Prescription,
-    wavelength: float,
-    start: Rays,
-    points: np.ndarray,
-    place: np.ndarray,
-    angle: float,
-) -> list[tuple[float, float]]:
-    """Discs (centre along a, radius) over the pupil's radius that the stop and the clear apertures
-    leave open, those that cut nothing left out; NumericsError where they leave nothing.
-
-    start: rays of a field;
-    points: (2, ray) x, y where they meet the stop, over its radius;
-    place: (2, ray) the same over the pupil's radius, along a and b;
-    angle: of the field, rad.
-    """
-    squares = [(points**2).sum(axis=0)]
-    for number, surface in enumerate(lens.surfaces):
-        if math.isfinite(surface.semi_diameter):
-            at = trace(lens.surfaces, start, wavelength, upto=number).position
-            squares.append((at[0] ** 2 + at[1] ** 2) / surface.semi_diameter**2)
-    if not (np.nan_to_num(squares, nan=2.0) <= 1).all(axis=0).any():
-        raise NumericsError(
-            f"the rims of the lens keep all light from a lenslet {math.degrees(angle):.3g} degrees "
-            "off the axis",
-            "main_lens.prescription",
-            "use a smaller array, or mend the semi_diameters of the lens",
-        )
-    found = [_circle(square, place) for square in squares]
-    return [disc for disc in found if disc and abs(disc[0]) + 1 > disc[1] + CUT]
-
-
-def _circle(square: np.ndarray, place: np.ndarray) -> tuple[float, float] | None:
-    """The disc (centre along a, radius) where `square` (ray,) is below 1, fitted where it is near
-    to 1; None where it is nowhere.
-    """
-    near = np.isfinite(square) & np.isfinite(place[0]) & (np.abs(square - 1) < 0.3)
-    if near.sum() < 12:
-        return None
-    a, b = place[:, near]
-    basis = np.stack([a * a + b * b, a, np.ones(a.shape)], axis=1)
-    curve, tilt, level = np.linalg.lstsq(basis, square[near], rcond=None)[0]
-    centre = -tilt / (2 * curve)
-    return float(centre), math.sqrt((1 - level) / curve + centre**2)

@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING
 
 from plenocli.base.errors import ConfigError
 from plenocli.forward.camera.field import at_field
-from plenocli.forward.camera.glass import focal_length
 from plenocli.forward.camera.pupil import aperture_area, ray_reach
 from plenocli.forward.camera.sections.lenslet_array import ROW_SPACING
 
@@ -27,6 +26,8 @@ if TYPE_CHECKING:
     import numpy as np
 
     from plenocli.forward.camera.model import Camera
+    from plenocli.forward.camera.sections.lenslet_array import LensletArray
+    from plenocli.forward.camera.sections.main_lens import MainLens
 
 
 TILED = 1e-4
@@ -347,7 +348,7 @@ def geometry(
     lens, array, sensor = camera.main_lens, camera.lenslet_array, camera.sensor
     design = camera.light.design_wavelength or wavelength
     f1, z1, z2 = (
-        focal_length(lens.focal_length, lens.glass, design, wavelength),
+        _focal_length(lens, design, wavelength),
         camera.object.distance,
         array.distance,
     )
@@ -357,7 +358,7 @@ def geometry(
         z2=z2,
         z3=sensor.distance,
         f1=f1,
-        f2=focal_length(array.focal_length, array.glass, design, wavelength),
+        f2=_focal_length(array, design, wavelength),
         D1=lens.aperture_diameter,
         D2=array.pitch,
         lenslet_width=array.pitch * array.fill_factor,
@@ -371,6 +372,15 @@ def geometry(
         ray_reach=ray_reach(lens, 1 / z1 + 1 / z2 - 1 / f1, z2),
         chief=chief,
     )
+
+
+def _focal_length(lens: MainLens | LensletArray, design: float, wavelength: float) -> float:
+    """Focal length (m) of the lens as a thin one of its glass."""
+    if lens.glass.lower() == "none":
+        return lens.focal_length
+    from plenocli.forward.camera.glass import focal_length
+
+    return focal_length(lens.focal_length, lens.glass, design, wavelength)
 
 
 def array_position(camera: Camera, row: int, column: int) -> tuple[float, float]:

@@ -18,7 +18,7 @@ import numpy as np
 
 from plenocli.base.errors import ConfigError, NumericsError
 from plenocli.forward.camera.prescription import Prescription
-from plenocli.forward.camera.pupil import zernike
+from plenocli.forward.camera.pupil import RIM, zernike
 from plenocli.forward.camera.raytrace import (
     Pupil,
     Rays,
@@ -29,6 +29,7 @@ from plenocli.forward.camera.raytrace import (
     to_plane,
     trace,
 )
+from plenocli.forward.camera.sections.main_lens import noll_indices
 
 # first order
 
@@ -608,3 +609,148 @@ def _lost_rim() -> NumericsError:
         "main_lens.prescription",
         "use a smaller aperture",
     )
+
+
+# as one lenslet sees it: a is the pupil coordinate towards the lenslet and b the one across
+
+Terms = tuple[tuple[int, float], ...]
+"""(Noll index, coefficient in m) of each."""
+Discs = tuple[tuple[float, float], ...]
+"""(centre along a, radius) of each, m."""
+OFF_AXIS_TERMS = 66
+"""Noll terms, of which the cosine ones describe a traced wavefront off the axis."""
+
+
+@functools.lru_cache(maxsize=1024)
+def traced_lens(
+    lens: Prescription,
+    object_distance: float,
+    aperture_diameter: float,
+    design_wavelength: float,
+    wavelength: float,
+    nominal: float,
+    slope: float,
+) -> tuple[float, Terms, Discs]:
+    """What a prescription is to a camera whose description gives it the focal length `nominal` (m).
+
+    object_distance, aperture_diameter, design_wavelength: of the camera, m;
+    wavelength: m;
+    slope: of the lenslet's chief ray, tangent of the angle behind the rear principal point.
+
+    Returns the focal length (m), Noll terms of the wavefront and the rims that cut the pupil.
+    Raises ConfigError where `nominal` is not the prescription's, or the lens cannot be used so (see
+    camera_lens), NumericsError where no light gets to the lenslet.
+    """
+    inside = camera_lens(lens, object_distance, aperture_diameter, design_wavelength)
+    own = first_order(lens, design_wavelength).focal_length
+    if abs(own / nominal - 1) > 0.02:
+        raise ConfigError(
+            (
+                f"the lens file has a focal length of {own * 1e3:.5g} mm at "
+                f"{design_wavelength * 1e9:.4g} nm, the camera says {nominal * 1e3:.5g} mm"
+            ),
+            "main_lens.focal_length",
+            "write the lens's own, or scale the lens: plenocli lens import --focal-length",
+        )
+    focal_length = inside.focal_length(wavelength)
+    terms, rims = _off_axis(inside, wavelength, slope)
+    if slope == 0:
+        terms = inside.aberrations(wavelength)
+    return focal_length, terms, rims
+
+
+def _off_axis(inside: CameraLens, wavelength: float, slope: float) -> tuple[Terms, Discs]:
+    """(Noll terms, rims) of a traced lens off the axis; arguments as traced_lens, _field_angle."""
+    points, weights = disc_points(24, 48)
+    angle = _field_angle(inside, wavelength, slope)
+    wave = wavefront(
+        inside.lens,
+        wavelength,
+        points,
+        angle,
+        inside.object_distance,
+        paraxial_image(inside.lens, wavelength, inside.object_distance),
+        clip=False,
+    )
+    place, radius = inside.pupil_places(wave.cosines, wavelength, slope), inside.radius
+    cosine = [j for j in range(2, OFF_AXIS_TERMS + 1) if noll_indices(j)[1] >= 0]
+    lit = np.isfinite(wave.error)
+    if lit.sum() < 4 * len(cosine):
+        raise NumericsError(
+            f"{int(lit.sum())} rays get through the lens {math.degrees(angle):.3g} degrees off the "
+            "axis, too few to know its wavefront",
+            "main_lens.prescription",
+            "use a smaller array",
+        )
+    a, b = place[:, lit] / radius
+    root = np.sqrt(weights[lit])
+    basis = np.stack([np.ones(a.shape), *(zernike(j, b, a) for j in cosine)], axis=1)
+    found = np.linalg.lstsq(basis * root[:, None], wave.error[lit] * root, rcond=1e-10)[0][1:]
+    start = aim(
+        inside.lens, wavelength, points, angle=angle, object_distance=inside.object_distance
+    )
+    rims = _rims(inside.lens, wavelength, start, points, place / radius, angle)
+    terms = tuple((j, float(c)) for j, c in zip(cosine, found))
+    return terms, tuple((centre * radius, size * radius) for centre, size in rims)
+
+
+def _field_angle(inside: CameraLens, wavelength: float, slope: float) -> float:
+    """The field angle (rad) whose chief ray meets the image plane where a straight line of that
+    slope from the rear principal point does, distortion included.
+    """
+    lens = inside.lens
+    before = inside.object_distance + entrance_pupil(lens, lens.design_wavelength).position
+    tangent, height = slope * inside.z1 / before, slope * inside.z2
+    image = paraxial_image(lens, lens.design_wavelength, inside.object_distance)
+    for _ in range(8 if slope else 0):
+        found = chief_height(lens, wavelength, math.atan(tangent), inside.object_distance, image)
+        tangent *= height / found
+        if abs(found / height - 1) < 1e-6:
+            break
+    return math.atan(tangent)
+
+
+def _rims(
+    lens: Prescription,
+    wavelength: float,
+    start: Rays,
+    points: np.ndarray,
+    place: np.ndarray,
+    angle: float,
+) -> list[tuple[float, float]]:
+    """Discs (centre along a, radius) over the pupil's radius that the stop and the clear apertures
+    leave open, those that cut nothing left out; NumericsError where they leave nothing.
+
+    start: rays of a field;
+    points: (2, ray) x, y where they meet the stop, over its radius;
+    place: (2, ray) the same over the pupil's radius, along a and b;
+    angle: of the field, rad.
+    """
+    squares = [(points**2).sum(axis=0)]
+    for number, surface in enumerate(lens.surfaces):
+        if math.isfinite(surface.semi_diameter):
+            at = trace(lens.surfaces, start, wavelength, upto=number).position
+            squares.append((at[0] ** 2 + at[1] ** 2) / surface.semi_diameter**2)
+    if not (np.nan_to_num(squares, nan=2.0) <= 1).all(axis=0).any():
+        raise NumericsError(
+            f"the rims of the lens keep all light from a lenslet {math.degrees(angle):.3g} degrees "
+            "off the axis",
+            "main_lens.prescription",
+            "use a smaller array, or mend the semi_diameters of the lens",
+        )
+    found = [_circle(square, place) for square in squares]
+    return [disc for disc in found if disc and abs(disc[0]) + 1 > disc[1] + RIM]
+
+
+def _circle(square: np.ndarray, place: np.ndarray) -> tuple[float, float] | None:
+    """The disc (centre along a, radius) where `square` (ray,) is below 1, fitted where it is near
+    to 1; None where it is nowhere.
+    """
+    near = np.isfinite(square) & np.isfinite(place[0]) & (np.abs(square - 1) < 0.3)
+    if near.sum() < 12:
+        return None
+    a, b = place[:, near]
+    basis = np.stack([a * a + b * b, a, np.ones(a.shape)], axis=1)
+    curve, tilt, level = np.linalg.lstsq(basis, square[near], rcond=None)[0]
+    centre = -tilt / (2 * curve)
+    return float(centre), math.sqrt((1 - level) / curve + centre**2)

@@ -80,10 +80,10 @@ class Fitted(Section):
 
 def _check_range(section: str, glass: str, wavelengths: Sequence[float]) -> None:
     """ValueError where a glass is not described at one of the wavelengths (m)."""
-    from plenocli.forward.camera.glass import medium
-
     if glass.lower() == "none":
         return
+    from plenocli.forward.camera.glass import medium
+
     try:
         for wavelength in wavelengths:
             medium(glass).index(wavelength)

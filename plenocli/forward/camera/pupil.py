@@ -35,6 +35,8 @@ if TYPE_CHECKING:
 
 POLARISATIONS = "0 deg", "90 deg"
 """Two orthogonal states of light."""
+RIM = 1e-4
+"""Share of the pupil's radius that a rim must reach into it to count."""
 STRIPS = 64
 """By which polygons are scanned, at least."""
 Polygon = Sequence[tuple[float, float]]

@@ -8,32 +8,23 @@ column against it.
 
 from __future__ import annotations
 
+import importlib
 import math
 from abc import ABC, abstractmethod
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from plenocli.forward.propagation.costs import law
-from plenocli.forward.propagation.exact import cost_law, openings
-from plenocli.forward.propagation.exact import lenslets as exact
-from plenocli.forward.propagation.exact.oblique import neglected
-from plenocli.forward.propagation.exact.open_fields import too_near
-from plenocli.forward.propagation.exact.trial import paraxial_off
-from plenocli.forward.propagation.fresnel import paraxial_error, shaped, square_cost
-from plenocli.forward.propagation.fresnel.square import SquareLenslets
-from plenocli.forward.propagation.harmonics import cost_law as harmonic_cost
-from plenocli.forward.propagation.harmonics import lenslets as harmonics
-from plenocli.forward.propagation.harmonics import sizing as harmonic_sizing
-from plenocli.forward.propagation.lenslet_fields import LensletFields
+from plenocli.forward.propagation.fresnel import paraxial_error
 from plenocli.forward.propagation.plan import BandPlan, PifPlan
-from plenocli.forward.propagation.ray import rays
 from plenocli.forward.propagation.sampling import coherent_window, is_symmetric, size_band, touch
 
 if TYPE_CHECKING:
     from plenocli.forward.camera.geometry import Geometry
     from plenocli.forward.camera.model import Camera
     from plenocli.forward.propagation.costs import Cost, Features
+    from plenocli.forward.propagation.lenslet_fields import LensletFields
 
 
 TRIED = 1.05
@@ -44,19 +35,39 @@ found on.
 """
 
 
+class Later:
+    """A function or class of this room that is imported when it is first called: a command plans
+    with one or two of the models, and starts without the code of the others.
+
+    module: where it is;
+    name: there.
+    """
+
+    def __init__(self, module: str, name: str) -> None:
+        self.module, self.name = f"{__package__}.{module}", name
+
+    def __call__(self, *args: Any) -> Any:
+        return getattr(importlib.import_module(self.module), self.name)(*args)
+
+
+def later(module: str, name: str) -> Any:
+    """Later, for whoever checks types: anything that may be called."""
+    return Later(module, name)
+
+
 class Model(ABC):
     """One way to compute a system matrix.
 
     name: as plans and tables show it;
     kind: "ray", "fresnel" or "exact", what --model asks for;
-    lenslets: the LensletFields that compute it;
+    lenslets: the LensletFields that compute it, Later;
     libraries: with threads of their own, which it computes with beside numpy;
     on_device: whether a graphics card may do a part of it.
     """
 
     name: str
     kind: str
-    lenslets: type[LensletFields]
+    lenslets: Later
     libraries: tuple[str, ...] = ()
     on_device: bool = False
 
@@ -154,6 +165,9 @@ def _paraxial_error(
     parabolic = _parabolic(camera)
     if touch(geometry) and geometry.diffraction_cells > FEW_CELLS:
         return paraxial_error.paraxial_error(geometry, parabolic)
+    from plenocli.forward.propagation.exact.open_fields import too_near
+    from plenocli.forward.propagation.exact.trial import paraxial_off
+
     found = None
     if too_near(geometry) is None:
         window = coherent_window(geometry, superpixels, ring)
@@ -168,16 +182,19 @@ def _error_off_the_axis(
     """Of the exact models: none on the axis, where they are what others are measured by; off it
     spherical waves are.
     """
+    from plenocli.forward.propagation.exact.oblique import neglected
+
     return min(1.0, neglected(geometry))
 
 
 class Rays(Model):
     """Geometric optics."""
 
-    name, kind, lenslets = "rays", "ray", rays.RayLenslets
-    valid_for = staticmethod(rays.valid_for)
-    size = staticmethod(rays.size_band)
-    features = staticmethod(rays.features)
+    name, kind = "rays", "ray"
+    lenslets = later("ray.rays", "RayLenslets")
+    valid_for = later("ray.rays", "valid_for")
+    size = later("ray.rays", "size_band")
+    features = later("ray.rays", "features")
 
     def error_bound(
         self, camera: Camera, geometry: Geometry, superpixels: tuple[int, int], ring: int
@@ -185,6 +202,8 @@ class Rays(Model):
         """As Model.error_bound; a law that is within 2.5 of what was measured promises only what
         its double is.
         """
+        from plenocli.forward.propagation.ray import rays
+
         waves = _paraxial_error(camera, geometry, superpixels, ring)
         return min(2.0, math.hypot(2 * rays.error_bound(camera, geometry, ring > 0), waves))
 
@@ -192,42 +211,46 @@ class Rays(Model):
 class FresnelLowRank(Model):
     """Paraxial waves through square lenslets."""
 
-    name, kind, lenslets = "fresnel, low rank", "fresnel", SquareLenslets
+    name, kind = "fresnel, low rank", "fresnel"
+    lenslets = later("fresnel.square", "SquareLenslets")
     valid_for = staticmethod(_square_only)
     error_bound = staticmethod(_paraxial_error)
     size = staticmethod(partial(size_band, dim=True))
-    features = staticmethod(square_cost.features)
+    features = later("fresnel.square_cost", "features")
 
 
 class FresnelTripleProduct(Model):
     """Paraxial waves through lenslets of any shape."""
 
-    name, kind, lenslets = "fresnel, triple product", "fresnel", shaped.ShapedLenslets
-    valid_for = staticmethod(shaped.valid_for)
+    name, kind = "fresnel, triple product", "fresnel"
+    lenslets = later("fresnel.shaped", "ShapedLenslets")
+    valid_for = later("fresnel.shaped", "valid_for")
     error_bound = staticmethod(_paraxial_error)
     size = staticmethod(size_band)
-    features = staticmethod(shaped.features)
+    features = later("fresnel.shaped", "features")
 
 
 class ExactLowRank(Model):
     """Scalar waves without the paraxial approximation, through square lenslets."""
 
-    name, kind, lenslets = "exact, low rank", "exact", exact.ExactSquareLenslets
+    name, kind = "exact, low rank", "exact"
     libraries, on_device = ("scipy.linalg",), True
-    valid_for = staticmethod(exact.valid_for)
-    size = staticmethod(exact.exact_band)
-    features = staticmethod(cost_law.features)
+    lenslets = later("exact.lenslets", "ExactSquareLenslets")
+    valid_for = later("exact.lenslets", "valid_for")
+    size = later("exact.lenslets", "exact_band")
+    features = later("exact.cost_law", "features")
     error_bound = staticmethod(_error_off_the_axis)
 
 
 class ExactHarmonics(Model):
     """Scalar waves without the paraxial approximation, through round and hexagonal lenslets."""
 
-    name, kind, lenslets = "exact, harmonics", "exact", harmonics.CentredLenslets
+    name, kind = "exact, harmonics", "exact"
     libraries = ("scipy.fft", "scipy.sparse")
-    valid_for = staticmethod(harmonics.valid_for)
-    size = staticmethod(harmonic_sizing.harmonic_band)
-    features = staticmethod(harmonic_cost.features)
+    lenslets = later("harmonics.lenslets", "CentredLenslets")
+    valid_for = later("harmonics.lenslets", "valid_for")
+    size = later("harmonics.sizing", "harmonic_band")
+    features = later("harmonics.cost_law", "features")
 
     def error_bound(
         self, camera: Camera, geometry: Geometry, superpixels: tuple[int, int], ring: int
@@ -239,10 +262,11 @@ class ExactHarmonics(Model):
 class ExactOpenings(Model):
     """Scalar waves without the paraxial approximation, through openings of any shape."""
 
-    name, kind, lenslets = "exact, openings", "exact", openings.OpenLenslets
-    valid_for = staticmethod(openings.valid_for)
-    size = staticmethod(openings.opening_band)
-    features = staticmethod(openings.features)
+    name, kind = "exact, openings", "exact"
+    lenslets = later("exact.openings", "OpenLenslets")
+    valid_for = later("exact.openings", "valid_for")
+    size = later("exact.openings", "opening_band")
+    features = later("exact.openings", "features")
     error_bound = staticmethod(_error_off_the_axis)
 
 

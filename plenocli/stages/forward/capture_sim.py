@@ -72,8 +72,7 @@ def run_capture_sim(
     """
     from plenocli.files.artefacts.provenance import Provenance, describe_inputs
     from plenocli.files.atomic import together
-    from plenocli.files.config.camera_file import to_toml
-    from plenocli.files.config.microscope_file import describes_microscope
+    from plenocli.files.config.camera_file import describes_microscope, to_toml
     from plenocli.files.images.mosaic import write_capture
     from plenocli.files.read.cameras import read_camera
 
@@ -183,7 +182,7 @@ def _of_volume(
     command: str,
 ) -> CaptureSummary:
     """The capture of a volume or of layers; UsageError where one is not what the other needs."""
-    from plenocli.files.config.microscope_file import describes_microscope
+    from plenocli.files.config.camera_file import describes_microscope
     from plenocli.stages.forward.volume_capture import run_volume_capture
 
     microscope = describes_microscope(camera_path)

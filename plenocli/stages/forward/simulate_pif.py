@@ -87,7 +87,7 @@ def run_simulate_pif(
     Raises InputError and ConfigError for the camera, UsageError for options, NumericsError where
     memory or accuracy do not suffice, OutputError where the file cannot be written.
     """
-    from plenocli.files.config.microscope_file import describes_microscope
+    from plenocli.files.config.camera_file import describes_microscope
     from plenocli.files.read.cameras import read_camera
 
     if not explain:
@@ -185,10 +185,10 @@ class _Task:
 
 def _planes(camera: Camera, settings: Settings, needs: SceneNeeds | None) -> DepthPlanes | None:
     """The planes that stand for the depth of a scene; None where it says nothing of depth."""
-    from plenocli.forward.accuracy.depth_planes import depth_planes, plane_camera
-
     if needs is None or needs.depth is None:
         return None
+    from plenocli.forward.accuracy.depth_planes import depth_planes, plane_camera
+
     near, far = needs.depth
     middle = _planned(plane_camera(camera, 2 / (1 / near + 1 / far)), settings, needs)
     wavelength = min(band.wavelength for band in middle.bands)
@@ -199,10 +199,10 @@ def _jobs(
     camera: Camera, settings: Settings, needs: SceneNeeds | None, planes: DepthPlanes | None
 ) -> list[_Job]:
     """The matrices to compute: one, or one a plane, each with a neighbourhood of its own."""
-    from plenocli.forward.accuracy.depth_planes import left_for_planes, plane_camera
-
     if planes is None:
         return [_Job(camera, _planned(camera, settings, needs))]
+    from plenocli.forward.accuracy.depth_planes import left_for_planes, plane_camera
+
     if planes.error and settings.accuracy is not None:
         settings = replace(settings, accuracy=left_for_planes(settings.accuracy))
     found = []

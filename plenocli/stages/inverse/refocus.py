@@ -127,7 +127,8 @@ def run_refocus(
 
 
 def _optics(camera: Path) -> Optics | MicroscopeOptics:
-    from plenocli.files.config.microscope_file import describes_microscope, load_microscope
+    from plenocli.files.config.camera_file import describes_microscope
+    from plenocli.files.config.microscope_file import load_microscope
     from plenocli.files.read.cameras import read_camera
     from plenocli.inverse.lightfield.optics import MicroscopeOptics, Optics
 

@@ -509,8 +509,8 @@ def _measured(task: Task, folder: Path, pif: Path | None, white: Path) -> Path:
 
 def _design(camera_path: Path, cost: MatrixCost | None) -> dict[str, float]:
     """Figures of the design itself, those of DESIGN."""
-    from plenocli.files.config.camera_file import load_camera
-    from plenocli.files.config.microscope_file import describes_microscope, load_microscope
+    from plenocli.files.config.camera_file import describes_microscope, load_camera
+    from plenocli.files.config.microscope_file import load_microscope
 
     camera: Description
     if describes_microscope(camera_path):

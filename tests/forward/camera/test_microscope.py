@@ -5,12 +5,8 @@ from pathlib import Path
 import pytest
 
 from plenocli.base.errors import ConfigError
-from plenocli.files.config.microscope_file import (
-    describes_microscope,
-    load_microscope,
-    microscope_toml,
-    parse_microscope,
-)
+from plenocli.files.config.camera_file import describes_microscope
+from plenocli.files.config.microscope_file import load_microscope, microscope_toml, parse_microscope
 
 SAMPLES = Path(__file__).resolve().parents[3] / "sample_configs"
 TEXT = (SAMPLES / "microscope.toml").read_text()

@@ -100,11 +100,12 @@ class FieldRow(Section):
 
 
 def _known_glass(name: str) -> str:
+    if name.lower() == "none":
+        return name
     from plenocli.forward.camera.glass import medium
 
     try:
-        if name.lower() != "none":
-            medium(name)
+        medium(name)
     except ConfigError as error:
         raise ValueError(f"{error.what}; {error.fix}") from None
     return name

@@ -112,7 +112,10 @@ def main(argv: list[str] | None = None) -> None:
     """Run the command line and exit; every expected failure is one message on stderr
     and its exit code.
     """
-    sys.exit(run(argv))
+    try:
+        sys.exit(run(argv))
+    finally:
+        gc.freeze()  # or a process that ends looks through all it has for garbage, three times
 
 
 def run(argv: list[str] | None = None) -> int:

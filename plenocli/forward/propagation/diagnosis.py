@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -100,21 +100,29 @@ class Spectrum:
         self._rows, self._longest, self._squares = 0, 0.0, np.zeros(self._shape)
         self._unit = 0.0
 
-    def add(self, part: np.ndarray, times: int = 1) -> None:
+    def add(
+        self, part: np.ndarray, times: np.ndarray | int = 1, exchanged: np.ndarray | None = None
+    ) -> None:
         """Add rows of the matrix.
 
         part: (..., point);
-        times: how many rows of the whole each stands for, in all orientations together.
+        times: how many rows of the whole each stands for, in all orientations together;
+        exchanged: as part, the rows that are the same but for rounding and rows and columns of
+            points exchanged; None: there are none, or they come by themselves.
         """
         self._unit = float(np.finfo(part.dtype).eps) / 2
-        part = part.reshape(-1, *self._shape)
-        self._rows += times * len(part)
+        part = part.reshape(-1, part.shape[-1])
+        times = np.broadcast_to(times, len(part))
+        self._rows += int(times.sum())
         for start in range(0, len(part), _ROWS):
             rows = part[start : start + _ROWS].astype(float)
-            squares = rows**2
-            self._squares += times * squares.sum(axis=0)
-            self._longest = max(self._longest, float(squares.sum(axis=(1, 2)).max()))
-            blocks = [block * np.sqrt(times) for block in self._blocks(rows)]
+            if exchanged is not None:
+                rows += _exchanged(exchanged[start : start + _ROWS], self._shape)
+                rows *= 0.5
+            self._longest = max(self._longest, float(np.einsum("rp,rp->r", rows, rows).max()))
+            rows *= np.sqrt(times[start : start + _ROWS, None])
+            self._squares += np.einsum("rp,rp->p", rows, rows).reshape(self._shape)
+            blocks = list(self._blocks(rows.reshape(-1, *self._shape)))
             self._triangles = (
                 [_reduced(r, b) for r, b in zip(self._triangles, blocks)]
                 if self._triangles
@@ -159,9 +167,15 @@ class Spectrum:
             return
         even, mixed, other, odd = blocks
         yield from _turn_parities(even)
-        both = np.concatenate([mixed, other.transpose(0, 2, 1)]) * np.sqrt(0.5)
+        both = np.concatenate([mixed, other.transpose(0, 2, 1)])
+        both *= np.sqrt(0.5)
         yield both.reshape(len(both), -1)
         yield from _turn_parities(odd)
+
+
+def _exchanged(rows: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Rows (row, point) with rows and columns of points exchanged."""
+    return rows.reshape(-1, *shape).transpose(0, 2, 1).reshape(len(rows), -1)
 
 
 def _triangle(rows: np.ndarray) -> np.ndarray:
@@ -198,19 +212,19 @@ def _turn_parities(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     upper, lower = np.triu_indices(values.shape[1], 1)
     diagonal = np.arange(values.shape[1])
     one, other = values[:, upper, lower], values[:, lower, upper]
-    even = np.concatenate([(one + other) * np.sqrt(0.5), values[:, diagonal, diagonal]], axis=1)
-    return even, (one - other) * np.sqrt(0.5)
+    even, odd = (one + other) * np.sqrt(0.5), (one - other) * np.sqrt(0.5)
+    return np.concatenate([even, values[:, diagonal, diagonal]], axis=1), odd
 
 
 def _parities(values: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
     """Parts even and odd under reversal of an axis, in orthonormal coordinates."""
-    low, high = np.array_split(values, [(values.shape[axis] + 1) // 2], axis)
-    count = high.shape[axis]
-    first, middle = np.array_split(low, [count], axis)
-    mirrored = np.flip(high, axis)
-    return np.concatenate([(first + mirrored) * np.sqrt(0.5), middle], axis), (
-        first - mirrored
-    ) * np.sqrt(0.5)
+    size = values.shape[axis]
+    first, middle, last = np.array_split(values, [size // 2, (size + 1) // 2], axis)
+    mirrored = np.flip(last, axis)
+    even, odd = first + mirrored, first - mirrored
+    for part in (even, odd):
+        part *= np.sqrt(0.5)
+    return (np.concatenate([even, middle], axis) if size % 2 else even), odd
 
 
 def symmetry_defect(own: np.ndarray) -> float:
@@ -249,14 +263,14 @@ def features(camera: Camera, plan: PifPlan) -> dict[str, float]:
     """
     at = geometry(camera, plan.bands[0].wavelength, plan.pixel_shift)
     symmetry = expected_symmetry(camera, at, plan.shape)
-    _, _, pixels, points = plan.shape
+    points = plan.shape[-1]
     ry, rx = ((n - 1) // 2 for n in plan.superpixels)
     offsets = np.array([(r, c) for r in range(-ry, ry + 1) for c in range(-rx, rx + 1)])
-    mirrors = _own_mirrors(offsets, symmetry, at.pixel_shape)
     rows = sum(
-        pixels / 2 ** int(mirrors[index].sum()) for index, _ in superpixel_orbits(offsets, symmetry)
+        len(_own_pixels(offsets[index], symmetry, at.pixel_shape).pixels)
+        for index, _ in superpixel_orbits(offsets, symmetry)
     )
-    found = {"values": rows * points}
+    found: dict[str, float] = {"values": rows * points}
     if points <= LARGEST:
         flips = 2 ** (bool(symmetry[0]) + bool(symmetry[1]))
         widths = [points / flips] * flips
@@ -271,20 +285,37 @@ def features(camera: Camera, plan: PifPlan) -> dict[str, float]:
     return found
 
 
-def _own_mirrors(
-    offsets: np.ndarray, symmetry: Sequence[bool], pixel_shape: tuple[int, ...]
-) -> np.ndarray:
-    """(superpixel, 2): whether a superpixel mirrors itself in rows and columns, so that half of its
-    pixels tell all.
+class _OwnPixels(NamedTuple):
+    """Pixels that tell all of a superpixel: the first of those that the symmetry of A joins in it.
+
+    times: how many of the superpixel each stands for.
+    exchanged: the pixel that each becomes where rows and columns are exchanged, or None.
     """
-    return (np.asarray(offsets) == 0) & np.array(symmetry[:2]) & (np.array(pixel_shape) % 2 == 0)
+
+    pixels: np.ndarray
+    times: np.ndarray
+    exchanged: np.ndarray | None
+
+
+def _own_pixels(
+    offset: np.ndarray, symmetry: Sequence[bool], pixel_shape: tuple[int, int]
+) -> _OwnPixels:
+    """The _OwnPixels of the superpixel at an offset (2,)."""
+    first = np.arange(pixel_shape[0] * pixel_shape[1]).reshape(pixel_shape)
+    for axis in (0, 1):
+        if symmetry[axis] and offset[axis] == 0:
+            first = np.minimum(first, np.flip(first, axis))
+    turns = symmetry[2] and symmetry[0] == symmetry[1] and offset[0] == offset[1]
+    pixels, times = np.unique(np.minimum(first, first.T) if turns else first, return_counts=True)
+    row, column = np.divmod(pixels, pixel_shape[1])
+    return _OwnPixels(pixels, times, column * pixel_shape[1] + row if turns else None)
 
 
 class PiecewiseDiagnosis:
     """The Diagnosis of a matrix that comes superpixel by superpixel.
 
-    Only the first superpixel of each orbit is looked at (superpixel_orbits), and only half of one
-    that mirrors itself: the others hold the same light.
+    Only the first superpixel of each orbit is looked at (superpixel_orbits), and of one that is its
+    own mirror image only a part (_own_pixels): the others hold the same light.
     """
 
     def __init__(
@@ -302,11 +333,10 @@ class PiecewiseDiagnosis:
         pixel_shape, object_shape: rows and columns;
         symmetry: of A, as PifBuilder has it.
         """
-        self._pixel_shape = tuple(pixel_shape)
-        self._mirrors = _own_mirrors(offsets, symmetry, self._pixel_shape)
         self._own = int(np.flatnonzero((np.asarray(offsets) == 0).all(axis=1))[0])
-        self._times = {
-            first: len(members) for first, members in superpixel_orbits(offsets, symmetry)
+        self._looked_at = {
+            first: (_own_pixels(offsets[first], symmetry, pixel_shape), len(members))
+            for first, members in superpixel_orbits(offsets, symmetry)
         }
         self._spectra = [Spectrum(object_shape, symmetry) for _ in range(bands)]
         self._defects = [0.0] * bands
@@ -320,14 +350,11 @@ class PiecewiseDiagnosis:
         """
         if superpixel == self._own:
             self._defects[band] = symmetry_defect(slab)
-        if self._few and superpixel in self._times:
-            rows, columns = (
-                n // 2 if mirrors else n
-                for n, mirrors in zip(self._pixel_shape, self._mirrors[superpixel])
-            )
-            part = slab.reshape(*self._pixel_shape, -1)[:rows, :columns]
-            times = self._times[superpixel] * 2 ** int(self._mirrors[superpixel].sum())
-            self._spectra[band].add(part, times)
+        if self._few and superpixel in self._looked_at:
+            own, members = self._looked_at[superpixel]
+            part = slab if len(own.pixels) == len(slab) else slab[own.pixels]
+            exchanged = None if own.exchanged is None else slab[own.exchanged]
+            self._spectra[band].add(part, own.times * members, exchanged)
 
     def result(self, energy: np.ndarray) -> Diagnosis:
         """What was found, for column energies (band, point)."""

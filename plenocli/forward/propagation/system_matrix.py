@@ -463,11 +463,15 @@ class _OneSuperpixel:
         oy, ox = share.shape
         if self._turn:
             fill_below_diagonal(planes, share, rows)
+        # a row of pixels at a time: what numpy sets aside, where it cannot tell that both sides of
+        # an assignment are apart, stays in a cache
         if self._mirror_y:
-            planes[:, :, rows:, :columns] = planes[::-1, :, : oy - rows, :columns][:, :, ::-1]
+            for row, mirrored in zip(planes, planes[::-1]):
+                row[:, rows:, :columns] = mirrored[:, : oy - rows, :columns][:, ::-1]
             share[rows:, :columns] = share[: oy - rows, :columns][::-1]
         if self._mirror_x:
-            planes[:, :, :, columns:] = planes[:, ::-1, :, : ox - columns][:, :, :, ::-1]
+            for row in planes:
+                row[:, :, columns:] = row[::-1, :, : ox - columns][:, :, ::-1]
             share[:, columns:] = share[:, : ox - columns][:, ::-1]
         self._builder.require_all_light(share)
         return share

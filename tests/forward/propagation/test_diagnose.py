@@ -23,6 +23,7 @@ ISOLATED = dict(superpixels=(1, 1), coherent_ring=0)
         {"main_lens__aberrations": (dict(noll=7, coefficient=50e-9),)},
         {"main_lens__aberrations": (dict(noll=5, coefficient=50e-9),)},
         {"object__samples_per_lenslet": (7, 7)},
+        {"sensor__pixels_per_lenslet": (12, 12)},
     ],
     ids=str,
 )
@@ -44,6 +45,25 @@ def test_orbits_and_parities_give_the_values_of_the_whole(change):
     values = found.result(pif.column_energy).singular_values[0]
     assert np.abs(values - exact).max() < 1e-14 * exact[0]
     assert np.abs(values / exact - 1)[exact > 1e-12 * exact[0]].max() < 1e-3
+
+
+@pytest.mark.parametrize("shape", [(4, 4), (5, 5), (5, 4)])
+@pytest.mark.parametrize("offset", [(0, 0), (0, 1), (1, 1)])
+def test_pixels_that_tell_all_of_a_superpixel(shape, offset):
+    """Sums over them, times how many each stands for, are sums over all of an even picture."""
+    turns = shape[0] == shape[1]
+    picture = np.random.default_rng(4).normal(size=shape)
+    for axis in (0, 1):
+        if offset[axis] == 0:
+            picture = picture + np.flip(picture, axis)
+    if turns and offset[0] == offset[1]:
+        picture = picture + picture.T
+    own = diagnose._own_pixels(np.array(offset), (True, True, turns), shape)
+    assert picture.ravel()[own.pixels] @ own.times == pytest.approx(picture.sum())
+    assert len(own.pixels) == len(np.unique(picture.round(9)))
+    if turns and offset[0] == offset[1]:
+        assert (picture.ravel()[own.pixels] == picture.T.ravel()[own.pixels]).all()
+        assert (own.exchanged == np.arange(picture.size).reshape(shape).T.ravel()[own.pixels]).all()
 
 
 def test_pieces_without_symmetry_give_the_values_of_the_whole():

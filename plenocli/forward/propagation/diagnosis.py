@@ -227,14 +227,15 @@ def _parities(values: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
     return (np.concatenate([even, middle], axis) if size % 2 else even), odd
 
 
-def symmetry_defect(own: np.ndarray) -> float:
-    """max |A - A'| / max |A| for one superpixel's rows `own` (pixel, point); A' is A for the
-    object turned by 180 degrees.
+def symmetry_defect(own: np.ndarray, pixels: np.ndarray | None = None) -> float:
+    """max |A - A'| / max |A| for one superpixel's rows `own` (pixel, point), or some of its pixels;
+    A' is A for the object turned by 180 degrees.
     """
     half = (own.shape[1] + 1) // 2
+    pixels = np.arange(len(own)) if pixels is None else pixels
     peak = defect = 0.0
-    for start in range(0, len(own), _FEW_ROWS):
-        rows = own[start : start + _FEW_ROWS]
+    for start in range(0, len(pixels), _FEW_ROWS):
+        rows = own[pixels[start : start + _FEW_ROWS]]
         apart = rows[:, :half] - rows[:, ::-1][:, :half]
         peak = max(peak, float(rows.max()), -float(rows.min()))
         defect = max(defect, float(apart.max()), -float(apart.min()))
@@ -348,10 +349,12 @@ class PiecewiseDiagnosis:
         band, superpixel: numbers of the piece;
         slab: A of it, (pixel, point).
         """
+        if superpixel not in self._looked_at:
+            return
+        own, members = self._looked_at[superpixel]
         if superpixel == self._own:
-            self._defects[band] = symmetry_defect(slab)
-        if self._few and superpixel in self._looked_at:
-            own, members = self._looked_at[superpixel]
+            self._defects[band] = symmetry_defect(slab, own.pixels)
+        if self._few:
             part = slab if len(own.pixels) == len(slab) else slab[own.pixels]
             exchanged = None if own.exchanged is None else slab[own.exchanged]
             self._spectra[band].add(part, own.times * members, exchanged)

@@ -280,16 +280,17 @@ def _name_axes(file, names):
     An axis without values of its own gets a dataset that holds none, as netCDF-4 keeps such axes.
     """
     for path in sorted(names):
-        group = path.rpartition("/")[0]
-        for axis, (name, size) in enumerate(zip(names[path], file[path].shape)):
+        group, named = path.rpartition("/")[0], file[path]
+        for axis, (name, size) in enumerate(zip(names[path], named.shape)):
             where = f"{group}/{name}"
-            if where not in file:
-                file.create_dataset(where, shape=(size,), dtype="i1", track_times=False)
-                file[where].make_scale(f"{EMPTY_AXIS}{size:10d}")
-            elif not file[where].is_scale:
-                file[where].make_scale(name)
+            scale = file.get(where)
+            if scale is None:
+                scale = file.create_dataset(where, shape=(size,), dtype="i1", track_times=False)
+                scale.make_scale(f"{EMPTY_AXIS}{size:10d}")
+            elif not scale.is_scale:
+                scale.make_scale(name)
             if where != path:
-                file[path].dims[axis].attach_scale(file[where])
+                named.dims[axis].attach_scale(scale)
 
 
 def _reserve_dataset(file, path, shape, dtype):

@@ -402,7 +402,6 @@ def _explained(
         explain,
         planes_table,
     )
-    from plenocli.forward.accuracy.field_nodes import FieldNodes
 
     took = [command_seconds(job.camera, job.plan) for job in jobs]
     costs = [
@@ -421,8 +420,9 @@ def _explained(
     if refusal:
         plan = replace(plan, warnings=(*plan.warnings, f"would be refused: {refusal}"))
     text = explain(plan, costs[dearest].memory, took[dearest])
+    of_planes = several is not None and several.kind == "planes" and len(jobs) > 1
     if several is not None and len(jobs) > 1:
-        table = [] if isinstance(several, FieldNodes) else planes_table(costs)
+        table = planes_table(costs) if of_planes else []
         text = "\n".join([several.line(), *table, "", "the dearest:", text])
     return PlanSummary(
         plan=text,
@@ -434,7 +434,7 @@ def _explained(
         superpixels=plan.superpixels,
         coherent_ring=plan.coherent_ring,
         estimated_accuracy=plan.estimated,
-        planes=costs if len(jobs) > 1 and not isinstance(several, FieldNodes) else [],
+        planes=costs if of_planes else [],
     )
 
 

@@ -53,7 +53,9 @@ def nodes(path):
 
 @cache
 def imported(path):
-    """Absolute names of everything a module imports, at any depth of its code."""
+    """Absolute names of everything a module imports, at any depth of its code, and of the modules
+    beside it that it names to `later`.
+    """
     names = set()
     for node in nodes(path):
         if isinstance(node, ast.Import):
@@ -61,6 +63,8 @@ def imported(path):
         elif isinstance(node, ast.ImportFrom):
             assert not node.level, f"{path}: relative import"
             names |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
+        elif isinstance(node, ast.Call) and getattr(node.func, "id", None) == "later":
+            names |= {f"{name_of(path.parent)}.{a.value}" for a in node.args[:1]}
     return frozenset(names)
 
 

@@ -46,7 +46,9 @@ def test_from_the_command_to_the_squares_of_the_field(config, settings, tmp_path
 
     def watched(subscripts, *operands, **options):
         if len(operands) == 2 and operands[0] is operands[1]:
-            seen.add(tuple(frames_up()))
+            path = tuple(frames_up())
+            if path[0] != ("diagnosis.py", "describe"):  # which squares energies, not fields
+                seen.add(path)
         return einsum(subscripts, *operands, **options)
 
     monkeypatch.setattr(np, "einsum", watched)

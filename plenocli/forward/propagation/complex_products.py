@@ -16,10 +16,15 @@ def thirds(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def product_of_thirds(
-    left: Iterable[np.ndarray], right: Iterable[np.ndarray]
+    left: Iterable[np.ndarray], right: Iterable[np.ndarray], out: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(real part, imaginary part) of a product of matrices of which `thirds` are known."""
-    first, second, both = (a @ b for a, b in zip(left, right))
+    """(real part, imaginary part) of a product of matrices of which `thirds` are known.
+
+    out: (3, row, column), for the three products and what is made of them.
+    """
+    for a, b, product in zip(left, right, out):
+        np.matmul(a, b, out=product)
+    first, second, both = out
     both -= first
     both -= second
     first -= second

@@ -28,9 +28,9 @@ if TYPE_CHECKING:
 
 FILL = 0.85
 """Largest part of a sketch that the terms kept may fill."""
-NARROW, OVER = 2, 2
-"""A product is narrowed where its terms fit a sketch of its factors' over the first; random
-combinations that this is told from, over that.
+NARROW, OVER = (6, 3, 2), 2
+"""A product is narrowed where its terms fit a sketch of its factors' over the last; over the first
+they often do, at a tenth of the cost. Random combinations that this is told from, over that.
 """
 TESTED = 16
 """Random columns, at the least, by which it is told what those before them leave."""
@@ -202,11 +202,11 @@ class Product:
         so few terms, or its factors have few enough.
         """
         given, home = sum(x.shape[1] for x in self.left), self.device.get
-        count = given // NARROW
-        if given <= SMALL or count >= self.limit:
+        if given <= SMALL or given // NARROW[-1] >= self.limit:
             return None
-        directions, terms = self._directions(cut, count)
-        if terms > FILL * count:
+        tried = (self._directions(cut, given // part) for part in NARROW)
+        directions = next((found for found in tried if found), None)
+        if directions is None:
             return None
         x = orthonormal(self._times(0, directions))
         seen = self._through_basis(x)
@@ -216,10 +216,10 @@ class Product:
         here = home(x)
         return here, here if y is x else home(y), home(core)
 
-    def _directions(self, cut: float, count: int) -> tuple[list[Any], int]:
+    def _directions(self, cut: float, count: int) -> list[Any] | None:
         """Combinations of M's columns that span its range up to `cut`, as X_b^T times them for each
-        factor, and the terms that M has; no more than `count` of either. Found where M is small:
-        through random combinations of its rows and of its columns, OVER times as many.
+        factor; None where that takes nearly `count` or more. Found where M is small: through random
+        combinations of its rows and of its columns, OVER times as many.
         """
         many = min(OVER * count, self.limit)
         right = self._mixed(1, many)
@@ -235,8 +235,10 @@ class Product:
         # the k largest also fit what is random here, so that less than all of the rest is seen
         share = 1 - np.arange(count) * (1 / many - 1 / self.limit)
         terms = terms_within(self.device.get(s), cut * share, rest)
-        basis = basis @ _adjoint(vh[: int(terms / FILL) + 8, :])
-        return [m @ basis for m in right], terms
+        if terms > FILL * count:
+            return None
+        basis = basis @ _adjoint(vh[: min(count, int(terms / FILL) + 8), :])
+        return [m @ basis for m in right]
 
     def _missed(self, x: Any, core: Any, y: Any) -> float:
         """Root sum of squares of M - X K Y^T, estimated on random entries."""
@@ -301,10 +303,11 @@ def _add_product(out: np.ndarray, x: np.ndarray, y: np.ndarray) -> None:
     """out += x @ y, rows at a time, so that no second array of its size is needed."""
     three = np.iscomplexobj(x) and np.iscomplexobj(y) and min(len(x), len(y)) >= THREE_SERVE
     parts = thirds(y) if three else ()
+    work = np.empty((3, min(ROWS, len(x)), y.shape[1]), y.real.dtype) if three else out
     for start in range(0, len(x), ROWS):
         part, target = x[start : start + ROWS], out[start : start + ROWS]
         if three:
-            real, imaginary = product_of_thirds(thirds(part), parts)
+            real, imaginary = product_of_thirds(thirds(part), parts, work[:, : len(part)])
             target.real += real
             target.imag += imaginary
         else:

@@ -12,6 +12,7 @@ squared and summed over the nodes of each pixel before it leaves it.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
 from typing import Any
 
@@ -119,7 +120,7 @@ class Factors:
         lines = self.high.shape[2]
         (py, px), nodes = self.pixel_shape, self.pixel_nodes
         step = max(1, round(WORK_BYTES / (lines * 2 * self.wide.shape[2] * real.itemsize)))
-        work = np.empty((step * lines, 2 * self.wide.shape[2]), real)
+        work = np.empty((3 if self._thirds else 2) * step * lines * self.wide.shape[2], real)
         order = np.argsort(columns, kind="stable")
         starts = np.flatnonzero(np.diff(columns[order]) > 0) + 1
         for group in np.split(order, starts):
@@ -133,11 +134,12 @@ class Factors:
                 # neighbours in order lie together: no copy
                 together = len(at) == 1 or (np.diff(at) == 1).all()
                 chosen = slice(at[0], at[-1] + 1) if together else at
-                product = self._shown(self._product(sy, chosen, right, work[: len(at) * lines]))
-                # (point, node, pixel row x (part, node, pixel column)): |U|^2, summed over nodes
-                parts = product.reshape(len(part), nodes, -1)
-                energy = np.einsum("nqk,nqk->nk", parts, parts)
-                out[part] = np.einsum("nyqx->nyx", energy.reshape(len(part), py, 2 * nodes, px))
+                energy: np.ndarray | int = 0
+                for field in self._product(sy, chosen, right, work):
+                    # (point, node, pixel row x (part, node, pixel column)): squares over nodes
+                    parts = self._shown(field).reshape(len(part), nodes, -1)
+                    energy = energy + np.einsum("nqk,nqk->nk", parts, parts)
+                out[part] = np.einsum("nyqx->nyx", np.reshape(energy, (len(part), py, -1, px)))
 
     def _elsewhere(self, sy: int, sx: int, rows: np.ndarray, column: int) -> np.ndarray:
         """(point, pixel row, pixel column) of points of one column, by the device."""
@@ -154,12 +156,12 @@ class Factors:
         )
 
     def _shown(self, product: np.ndarray) -> np.ndarray:
-        """(points x lines, (real, imaginary) x lines) on the nodes."""
+        """(points x lines, parts x lines) on the nodes."""
         if not self.shown:
             return product
         (y, x), lines = self.shown, self.high.shape[2]
         wide = product.reshape(-1, x.shape[0]) @ x
-        return y @ wide.reshape(-1, lines, 2 * x.shape[1])
+        return y @ wide.reshape(product.shape[0] // lines, lines, -1)
 
     @cached_property
     def _thirds(self) -> tuple[np.ndarray, ...] | None:
@@ -167,19 +169,23 @@ class Factors:
         return thirds(self.high) if self.high.shape[3] >= THREE_SERVE else None
 
     def _product(
-        self, sy: int, chosen: slice | np.ndarray, right: tuple[np.ndarray, ...], out: np.ndarray
-    ) -> np.ndarray:
-        """Fields of chosen rows of points, (points x lines, (real, imaginary) x lines), into out.
+        self, sy: int, chosen: slice | np.ndarray, right: tuple[np.ndarray, ...], work: np.ndarray
+    ) -> Sequence[np.ndarray]:
+        """Fields of chosen rows of points, (points x lines, (real, imaginary) x lines) or each of
+        the two by itself; in `work`.
 
         right: as `_right`.
         """
         if self._thirds is None:
             left = self.high[sy, chosen].view(self.high.real.dtype)
-            return np.matmul(left.reshape(len(out), -1), right[0], out=out)
-        lefts = (part[sy, chosen].reshape(len(out), -1) for part in self._thirds)
-        width = out.shape[1] // 2
-        out[:, :width], out[:, width:] = product_of_thirds(lefts, right)
-        return out
+            left = left.reshape(-1, len(right[0]))
+            out = work[: len(left) * right[0].shape[1]].reshape(len(left), -1)
+            return [np.matmul(left, right[0], out=out)]
+        lefts = [part[sy, chosen].reshape(-1, part.shape[3]) for part in self._thirds]
+        count, width = len(lefts[0]), right[0].shape[1]
+        return product_of_thirds(
+            lefts, right, work[: 3 * count * width].reshape(3, count, width)
+        )
 
     def _right(self, factor: np.ndarray) -> tuple[np.ndarray, ...]:
         """(node, term) complex as the right-hand side of one real product, (term x (real,

@@ -269,7 +269,7 @@ class PifBuilder:
         total = np.zeros(self.object_shape)
         for first, members in self.orbits():
             one = _OneSuperpixel(self, first, A[first])
-            spread(one.parts, one.compute)
+            spread(one.parts[::-1], one.compute)  # the longest first
             share = one.complete()
             for index, how in members:
                 total += turned_planes(share[None, None], how)[0, 0]
@@ -295,7 +295,7 @@ class PifBuilder:
         total = np.zeros(self.object_shape)
         for first, members in self.orbits():
             one = _OneSuperpixel(self, first, slab)
-            spread(one.parts, one.compute)
+            spread(one.parts[::-1], one.compute)  # the longest first
             share = one.complete()
             for index, how in members:
                 total += turned_planes(share[None, None], how)[0, 0]

@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -228,14 +228,14 @@ class Interval:
     def sheet(
         self,
         other: float,
-        functions: Callable[[np.ndarray, np.ndarray], np.ndarray],
+        functions: Callable[[np.ndarray, np.ndarray, np.dtype], np.ndarray],
         mixing: np.ndarray,
         kept: tuple[np.ndarray, ...],
     ) -> np.ndarray:
         """X, what terms of the kernel and of the main lens's field bring to the superpixel.
 
         other: displacement (m) along the other axis;
-        functions: (u, x) -> (r, u, x), the kernel's residual;
+        functions: (u, x, type) -> (r, u, x), the kernel's residual;
         mixing: (i', i), terms i of the field in those of this interval;
         kept: (r, i) of the pairs that are wanted.
 
@@ -244,7 +244,7 @@ class Interval:
         wave, (kept_r, kept_i) = self.wave(other), kept
         values = mixing.T.astype(self.values.dtype) @ self.values
         out = np.empty((self.side.lines, len(kept_r), values.shape[2]), self.dtype)
-        for r, term in enumerate(functions(self.side.u, self.x)):
+        for r, term in enumerate(functions(self.side.u, self.x, self.dtype)):
             some = np.flatnonzero(kept_r == r)
             if len(some):
                 terms = kept_i[some]
@@ -302,13 +302,13 @@ class Pair:
             thin(residual.core.astype(self.row.dtype)), thin(field.astype(self.row.dtype)), kept
         )
         x = self.row.sheet(
-            self.column.offset, lambda u, x: residual.functions(0, u, x), left, kept[0]
+            self.column.offset, partial(residual.functions, 0), left, kept[0]
         )
         y = (
             x
             if self.symmetric
             else self.column.sheet(
-                self.row.offset, lambda u, x: residual.functions(1, u, x), right, kept[1]
+                self.row.offset, partial(residual.functions, 1), right, kept[1]
             )
         )
         # now that it is seen what each term brings: residuals send light where the

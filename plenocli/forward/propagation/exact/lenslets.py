@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -66,12 +66,13 @@ SPILL = 0.25
 what a lenslet's far edge diffracts there is up to 0.23 of it (two cameras, f/4.4 and f/8).
 """
 
-DIM, CONCENTRATION, WORST = 4.0, 0.7, 0.5
+DIM, CONCENTRATION, EVENLY, WORST = 4.0, 0.7, 0.35, 0.5
 """On superpixels beside the own one. Errors of dim light may be as large as what adds so many cuts
 to the light by their own energy. Of what lenslets may lose, of all points together, those that
-count most take more than their share: 1 would leave them none of it, 0 all. No point may lose more
-than so many cuts where terms are left out, by its own light where that is less than the dimmest
-that was tried. (Worst columns of two cameras, 5e-2 to 1e-4, as where all points count fully.)
+count most take more than their share: 1 would leave them none of it, 0 all. (What narrowing takes
+is spread more evenly, at most 3.5 times the mean at f/4.4.) No point may lose more than so many
+cuts where terms are left out, by its own light where that is less than the dimmest that was tried.
+(Worst columns of two cameras, 5e-2 to 1e-4, as where all points count fully.)
 """
 
 LEAST = 1e-10
@@ -145,6 +146,38 @@ def valid_for(camera: Camera, geometry: Geometry) -> str | None:
     return too_near(geometry)
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Lit:
+    """A superpixel and the light that is followed to it.
+
+    at: row and column, from the object's own;
+    symmetric: whether all about it is its own mirror image by the diagonal;
+    kept: lenslets (row, column) and what they bring, the brightest last;
+    cut: root energy of a mean point's field that all lenslets together may lose;
+    narrowing, whole: of all points' fields, by narrowing lenslets' products and the joined one;
+    guess: columns of the first sketch of that;
+    spanned: whether these are kept as its terms;
+    parts: of each lenslet, as Product has them, until they are joined.
+    """
+
+    at: tuple[int, int]
+    symmetric: bool
+    kept: dict[tuple[int, int], Pair]
+    cut: float
+    narrowing: float
+    whole: float
+    guess: int
+    spanned: bool
+    parts: dict[tuple[int, int], tuple[np.ndarray, np.ndarray, Matrix]] = field(
+        default_factory=dict
+    )
+
+    @property
+    def brightest(self) -> tuple[int, int]:
+        """The lenslet that brings most."""
+        return list(self.kept)[-1]
+
+
 class ExactSquareLenslets(LensletFields):
     """Sensor fields behind square lenslets by the exact kernel; see the module."""
 
@@ -172,18 +205,19 @@ class ExactSquareLenslets(LensletFields):
         )
         self._sensor_sides: dict[tuple[int, int, bool], SensorSide] = {}
         self._intervals: dict[tuple[int, int, int, bool], Interval] = {}
-        pairs = self._pairs()
-        for sy, sx in pairs:  # what tables share is there before threads ask for it
-            for m, n in self._lit_by(sy, sx):
-                self._meet(sy, sx, m, n)
         self._tables: dict[tuple[int, int], Factors] = {}
         products: dict[tuple[int, int], int] = {}
+        largest_first = self._pairs()[::-1]
 
-        def compress(sy: int, sx: int) -> None:
-            self._tables[sy, sx], products[sy, sx] = self._compressed(sy, sx)
+        def join(lit: _Lit) -> None:
+            self._tables[lit.at], products[lit.at] = self._joined(lit)
 
         with within(replace(budget(), threads=plan.at_once)):
-            spread(pairs[::-1], compress)
+            self._meet_all(largest_first)
+            for start in range(0, len(largest_first), plan.at_once):
+                some = [self._lit(*at) for at in largest_first[start : start + plan.at_once]]
+                spread([(lit, key) for lit in some for key in lit.kept], self._follow)
+                spread([(lit,) for lit in some], join)
         self._intervals = {}
         self.notes = FieldNotes(
             separable_terms=max(t.high.shape[3] for t in self._tables.values()),
@@ -273,21 +307,19 @@ class ExactSquareLenslets(LensletFields):
             )
         return self._sensor_sides[s, axis, beside]
 
-    def _interval(self, s: int, m: int, axis: int, beside: bool) -> Interval:
-        axis, beside = 0 if self._turn else axis, beside and s != 0
-        if (s, m, axis, beside) not in self._intervals:
-            self._intervals[s, m, axis, beside] = Interval(
-                self.geometry,
-                self._field,
-                axis,
-                s,
-                m,
-                self._sensor_side(s, axis, beside),
-                self._parabolic,
-                self.band.cut / 3,
-                self.dtype,
-            )
-        return self._intervals[s, m, axis, beside]
+    def _interval(self, s: int, m: int, axis: int, beside: bool) -> None:
+        """Makes the interval from lenslet m to superpixel s along an axis."""
+        self._intervals[s, m, axis, beside] = Interval(
+            self.geometry,
+            self._field,
+            axis,
+            s,
+            m,
+            self._sensor_side(s, axis, beside),
+            self._parabolic,
+            self.band.cut / 3,
+            self.dtype,
+        )
 
     def _light(self) -> tuple[np.ndarray, list[np.ndarray]]:
         """Share of the light of a point (row, column) that enters the lenslets of the
@@ -344,10 +376,24 @@ class ExactSquareLenslets(LensletFields):
         rows, columns = self._lenslets(sy, 0), self._lenslets(sx, 1)
         return [(m, n) for m in rows for n in columns if not symmetric or m <= n]
 
-    def _meet(self, sy: int, sx: int, m: int, n: int) -> tuple[Interval, Interval]:
-        """Intervals of both axes from lenslet (m, n) to superpixel (sy, sx)."""
-        beside = bool(sy and sx)
-        return self._interval(sy, m, 0, beside), self._interval(sx, n, 1, beside)
+    def _meet_all(self, superpixels: Sequence[tuple[int, int]]) -> None:
+        """Makes all intervals, which tables share, before threads ask for them."""
+        keys = {
+            key
+            for sy, sx in superpixels
+            for m, n in self._lit_by(sy, sx)
+            for key in self._meeting(sy, sx, m, n)
+        }
+        for key in keys:  # what they share in turn
+            self._sensor_side(key[0], *key[2:])
+        spread(sorted(keys), self._interval)
+
+    def _meeting(
+        self, sy: int, sx: int, m: int, n: int
+    ) -> tuple[tuple[int, int, int, bool], tuple[int, int, int, bool]]:
+        """Keys of the intervals of both axes from lenslet (m, n) to superpixel (sy, sx)."""
+        beside, second = bool(sy and sx), 0 if self._turn else 1
+        return (sy, m, 0, beside), (sx, n, second, beside)
 
     # products of two axes
 
@@ -358,7 +404,10 @@ class ExactSquareLenslets(LensletFields):
         """
         symmetric = self._turn and sy == sx
         pairs = {
-            (m, n): Pair(*self._meet(sy, sx, m, n), symmetric and m == n == sy)
+            (m, n): Pair(
+                *(self._intervals[key] for key in self._meeting(sy, sx, m, n)),
+                symmetric and m == n == sy,
+            )
             for m, n in self._lit_by(sy, sx)
         }
         order = sorted(pairs, key=lambda key: pairs[key].weight)
@@ -368,53 +417,70 @@ class ExactSquareLenslets(LensletFields):
         kept = [key for key, power in zip(order, total) if power > least**2] or order[-1:]
         return {key: pairs[key] for key in kept}
 
-    def _compressed(self, sy: int, sx: int) -> tuple[Factors, int]:
-        """Factors of superpixel (sy, sx), and the pairs of terms that they are compressed from."""
-        symmetric, beside = self._turn and sy == sx, bool(sy and sx)
-        weights = [self._counts(s, axis, beside) for s, axis in ((sy, 0), (sx, 1))]
+    def _lit(self, sy: int, sx: int) -> _Lit:
+        """Superpixel (sy, sx) and the light that is followed to it."""
+        weights = [self._counts(s, axis, bool(sy and sx)) for s, axis in ((sy, 0), (sx, 1))]
         mean = math.prod(math.sqrt(np.mean(weight**2)) for weight in weights)
         cut = self.band.cut * mean**CONCENTRATION
         kept = self._bright(sy, sx, cut / 4)
+        all_points = math.sqrt(len(self._points(sy, 0)) * len(self._points(sx, 1)))
+        guess = int(sketch_size(self._expected_rank(sy, sx), joined=len(kept) > 1))
+        return _Lit(
+            at=(sy, sx),
+            symmetric=self._turn and sy == sx,
+            kept=kept,
+            cut=cut / 2,
+            narrowing=self.band.cut * mean**EVENLY / 2 * all_points,
+            whole=self.band.cut * all_points,
+            guess=guess,
+            spanned=len(kept) == 1 and is_spanned(guess),
+        )
+
+    def _follow(self, lit: _Lit, key: tuple[int, int]) -> None:
+        """What a lenslet brings to a superpixel, into its `parts`."""
+        pair = lit.kept[key]
+        each = 1 / math.sqrt(len(lit.kept))
+        # what is left out of many terms that meet no others adds by energy
+        tolerance = lit.cut if key == lit.brightest else lit.cut * each
+        weak = 2 * lit.cut if lit.spanned else tolerance / 2
+        x, y, coupling = pair.factors(max(self._extent), tolerance, weak)
+        if key != lit.brightest:  # its own rank may be far lower
+            one = Product([x], [y], {(0, 0): coupling}, pair.symmetric, self.device)
+            x, y, coupling = one.narrowed(lit.narrowing * each) or (x, y, coupling)
+        if len(lit.kept) > 1:  # lenslets interfere on the pixels
+            x, y = pair.on_pixels(x, y)
+        lit.parts[key] = x, y, coupling
+
+    def _joined(self, lit: _Lit) -> tuple[Factors, int]:
+        """Factors of a superpixel, and the pairs of terms that they are compressed from."""
         left: list[np.ndarray] = []
         right: list[np.ndarray] = []
         couplings: dict[tuple[int, int], Matrix] = {}
-        count = len(self._points(sy, 0)) * len(self._points(sx, 1))
-        alone, brightest = len(kept) == 1, list(kept.values())[-1]
-        guess = int(sketch_size(self._expected_rank(sy, sx), joined=not alone))
-        spanned = alone and is_spanned(guess)
-        for (m, n), pair in kept.items():
-            first, last = len(left), pair is brightest
-            tolerance = cut / 2 if last else cut / 2 / math.sqrt(len(kept))
-            # what is left out of many terms that meet no others adds by energy
-            weak = cut if spanned else tolerance / 2
-            x, y, coupling = pair.factors(max(self._extent), tolerance, weak)
-            if not last:  # its own rank may be far lower
-                one = Product([x], [y], {(0, 0): coupling}, pair.symmetric, self.device)
-                x, y, coupling = one.narrowed(tolerance / 2 * math.sqrt(count)) or (x, y, coupling)
-            if not alone:  # lenslets interfere on the pixels
-                x, y = pair.on_pixels(x, y)
+        for (m, n), pair in lit.kept.items():
+            x, y, coupling = lit.parts.pop((m, n))
+            first = len(left)
             # the lenslet mirrored by the diagonal brings the transpose
-            if symmetric and not pair.symmetric:
+            if lit.symmetric and not pair.symmetric:
                 left += [x, y]
                 half = coupling if m != n else coupling / 2
                 couplings |= {(first, first + 1): half, (first + 1, first): half.T}
             else:
                 left, right = [*left, x], [*right, y]
                 couplings[first, first] = coupling
-        right = left if symmetric else right
-        product = Product(left, right, couplings, symmetric, self.device)
+        right = left if lit.symmetric else right
+        product = Product(left, right, couplings, lit.symmetric, self.device)
         high, wide = (
-            product.spanned(self.band.cut * math.sqrt(count), guess)
-            if spanned
-            else product.factors(self.band.cut * math.sqrt(count), guess, self._worst(sy, sx))
+            product.spanned(lit.whole, lit.guess)
+            if lit.spanned
+            else product.factors(lit.whole, lit.guess, self._worst(*lit.at))
         )
+        (sy, sx), beside = lit.at, all(lit.at)
         sides = self._sensor_side(sy, 0, beside), self._sensor_side(sx, 1, beside)
         shown = None
-        if alone:  # of one lenslet's path no energy tells
+        if len(lit.kept) == 1:  # of one lenslet's path no energy tells
             shown = self._modes_shown(sides, high.shape[1])
             if not shown:
-                high, wide = brightest.on_pixels(high, wide)
-        products = sum(x.shape[1] for x in left)
+                high, wide = lit.kept[lit.brightest].on_pixels(high, wide)
         return Factors(
             self._by_point(high, sides[0])[None],
             self._by_point(wide, sides[1])[None],
@@ -422,7 +488,7 @@ class ExactSquareLenslets(LensletFields):
             self.band.pixel_nodes,
             shown=shown,
             device=self.device,
-        ), products
+        ), sum(x.shape[1] for x in left)
 
     def _modes_shown(
         self, sides: tuple[SensorSide, SensorSide], terms: int

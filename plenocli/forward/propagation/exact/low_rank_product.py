@@ -11,14 +11,14 @@ is done where the device has its arrays; what goes in and comes out are NumPy's.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
 from plenocli.base.device import CPU, Device, beside, namespace
 from plenocli.base.errors import NumericsError
-from plenocli.forward.propagation.complex_products import product_of_thirds, thirds
+from plenocli.forward.propagation.complex_products import THREE_SERVE, product_of_thirds, thirds
 from plenocli.forward.propagation.fresnel.spread_function import terms_within
 
 if TYPE_CHECKING:
@@ -38,8 +38,6 @@ SMALL = 40
 """Terms of factors that are not worth narrowing."""
 THIN = 1e-13
 """Entries of a coupling below this share of its largest are rounding of double precision."""
-THREE_SERVE = 1000
-"""Rows of both factors from which on three real products take less time than four."""
 ROWS = 1024
 """Rows of a product that are made together."""
 MAX_SKETCH = 2500
@@ -113,7 +111,8 @@ class Product:
     def _seen(self, q: Any) -> list[Any]:
         """X_a^T q* for each factor."""
         turned = self.device.xp.conj(q)
-        return [_product(x.T, turned) for x in self.left]
+        parts = thirds(turned) if isinstance(q, np.ndarray) and np.iscomplexobj(q) else ()
+        return [_product(x.T, turned, parts) for x in self.left]
 
     def _extend(self, q: Any | None, seen: list[Any] | None, count: int) -> tuple[Any, list[Any]]:
         """The basis q of M's range (None: not begun) with columns added up to `count`, and what
@@ -155,13 +154,17 @@ class Product:
             q, seen = self._extend(q, seen, size)
             p, core = self._core(q, seen)
             u, s, vh = xp.linalg.svd(core, full_matrices=False)
-            root = xp.sqrt(s)
-            high, wide = home(q @ (u * root)), home(p @ (vh.T * root))
-            terms = max(terms_within(home(s), cut), _terms_of_all(high, wide, worst))
-            u, v = u[:, :terms] * root[:terms], vh[:terms, :].T * root[:terms]
+            root, terms = xp.sqrt(s), terms_within(home(s), cut)
+            u, v = u * root, vh.T * root
+            if worst is not None:
+                high, wide = home(_product(q, u)), home(_product(p, v))
+                terms = max(terms, _terms_of_all(high, wide, worst))
+            u, v = u[:, :terms], v[:, :terms]
             if size >= self.limit or (
                 terms <= FILL * size and self._missed(q, u @ v.T, p) <= 2 * cut
             ):
+                if worst is None:
+                    return home(_product(q, u)), home(_product(p, v))
                 return high[:, :terms].copy(), wide[:, :terms].copy()
             if size >= MAX_SKETCH:
                 raise _too_many(size)
@@ -275,12 +278,10 @@ def _too_many(size: int) -> NumericsError:
     )
 
 
-def _terms_of_all(high: np.ndarray, wide: np.ndarray, worst: np.ndarray | None) -> int:
+def _terms_of_all(high: np.ndarray, wide: np.ndarray, worst: np.ndarray) -> int:
     """Terms of high wide^T, its columns by falling singular values, which they hold on either side,
     that it takes until no point loses more than `worst` (row, column).
     """
-    if worst is None:
-        return 1
     # what terms bring to a point: they are orthogonal over all points, and all but so over one
     rows, columns = (
         (np.abs(x.reshape(-1, n, x.shape[1])) ** 2).sum(axis=0).T
@@ -290,19 +291,21 @@ def _terms_of_all(high: np.ndarray, wide: np.ndarray, worst: np.ndarray | None) 
     return max(1, int(np.count_nonzero((lost > worst**2).any(axis=(1, 2)))))
 
 
-def _product(x: Any, y: Any) -> Any:
-    """x @ y."""
+def _product(x: Any, y: Any, parts: Sequence[np.ndarray] = ()) -> Any:
+    """x @ y; parts: thirds of y, where they are known."""
     if not isinstance(x, np.ndarray):
         return x @ y
     out = np.zeros((len(x), y.shape[1]), x.dtype)
-    _add_product(out, x, y)
+    _add_product(out, x, y, parts)
     return out
 
 
-def _add_product(out: np.ndarray, x: np.ndarray, y: np.ndarray) -> None:
+def _add_product(
+    out: np.ndarray, x: np.ndarray, y: np.ndarray, parts: Sequence[np.ndarray] = ()
+) -> None:
     """out += x @ y, rows at a time, so that no second array of its size is needed."""
-    three = np.iscomplexobj(x) and np.iscomplexobj(y) and min(len(x), len(y)) >= THREE_SERVE
-    parts = thirds(y) if three else ()
+    three = np.iscomplexobj(x) and np.iscomplexobj(y) and min(*x.shape, y.shape[1]) >= THREE_SERVE
+    parts = parts or thirds(y) if three else ()
     work = np.empty((3, min(ROWS, len(x)), y.shape[1]), y.real.dtype) if three else out
     for start in range(0, len(x), ROWS):
         part, target = x[start : start + ROWS], out[start : start + ROWS]

@@ -12,11 +12,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from plenocli.forward.camera.quadrature import gauss
 from plenocli.forward.propagation.fresnel.spread_function import legendre, terms_within
+
+if TYPE_CHECKING:
+    from numpy.typing import DTypeLike
 
 SLAB = 1 << 22
 """Numbers in a slab of displacements x polynomials."""
@@ -190,18 +194,28 @@ class Residual:
                 )
             )
 
-    def functions(self, axis: int, u: np.ndarray, x: np.ndarray) -> np.ndarray:
+    def functions(
+        self, axis: int, u: np.ndarray, x: np.ndarray, dtype: DTypeLike = complex
+    ) -> np.ndarray:
         """The functions of one axis: P_r (axis 0) or Q_s (axis 1).
 
-        u, x: positions on sensor and lenslet, m from their centres.
+        u, x: positions on sensor and lenslet, m from their centres;
+        dtype: complex, of what is returned.
 
         Returns (term, len(u), len(x)).
         """
+        values = np.ascontiguousarray(self._values[axis], dtype)
+        real = values.real.dtype
         rows, columns = (
-            legendre(place / reach, len(grid), 1) @ _series(grid)
+            (legendre(place / reach, len(grid), 1) @ _series(grid)).astype(real)
             for place, reach, grid in zip((u, x), (self.reach_u, self.reach_x), self._grids[axis])
         )
-        return rows @ self._values[axis] @ columns.T
+        # real by complex, which would be a product of complex numbers, is two of real ones
+        wide = (rows @ values.view(real)).view(values.dtype)
+        both = np.concatenate([wide.real, wide.imag], axis=1) @ columns.T
+        out = np.empty((len(values), len(u), len(x)), values.dtype)
+        out.real, out.imag = np.split(both, 2, axis=1)
+        return out
 
 
 def split(

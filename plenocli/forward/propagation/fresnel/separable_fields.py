@@ -19,15 +19,12 @@ from typing import Any
 import numpy as np
 
 from plenocli.base.device import CPU, Device
-from plenocli.forward.propagation.complex_products import product_of_thirds, thirds
+from plenocli.forward.propagation.complex_products import THREE_SERVE, product_of_thirds, thirds
 
 WORK_BYTES = 1 << 22
 """Size of the product before it is squared: small beside the shared cache, large enough that the
 right-hand side is packed for several points.
 """
-
-THREE_SERVE = 300
-"""Terms from which on three real products take less time than the four of a complex one."""
 
 LINES_SERVE = 0.8
 """Share of the operations that fields multiplied line by line may take: they are moved once more.

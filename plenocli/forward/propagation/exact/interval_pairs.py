@@ -301,15 +301,11 @@ class Pair:
         coupling = _coupled(
             thin(residual.core.astype(self.row.dtype)), thin(field.astype(self.row.dtype)), kept
         )
-        x = self.row.sheet(
-            self.column.offset, partial(residual.functions, 0), left, kept[0]
-        )
+        x = self.row.sheet(self.column.offset, partial(residual.functions, 0), left, kept[0])
         y = (
             x
             if self.symmetric
-            else self.column.sheet(
-                self.row.offset, partial(residual.functions, 1), right, kept[1]
-            )
+            else self.column.sheet(self.row.offset, partial(residual.functions, 1), right, kept[1])
         )
         # now that it is seen what each term brings: residuals send light where the
         # separable part does not

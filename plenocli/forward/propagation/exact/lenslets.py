@@ -405,13 +405,10 @@ class ExactSquareLenslets(LensletFields):
         least: root energy that these may have together.
         """
         symmetric = self._turn and sy == sx
-        pairs = {
-            (m, n): Pair(
-                *(self._intervals[key] for key in self._meeting(sy, sx, m, n)),
-                symmetric and m == n == sy,
-            )
-            for m, n in self._lit_by(sy, sx)
-        }
+        pairs = {}
+        for m, n in self._lit_by(sy, sx):
+            row, column = (self._intervals[key] for key in self._meeting(sy, sx, m, n))
+            pairs[m, n] = Pair(row, column, symmetric and m == n == sy)
         order = sorted(pairs, key=lambda key: pairs[key].weight)
         total = np.cumsum(
             [pairs[m, n].weight ** 2 * (2 if symmetric and m != n else 1) for m, n in order]

@@ -180,9 +180,7 @@ class Factors:
             return [np.matmul(left, right[0], out=out)]
         lefts = [part[sy, chosen].reshape(-1, part.shape[3]) for part in self._thirds]
         count, width = len(lefts[0]), right[0].shape[1]
-        return product_of_thirds(
-            lefts, right, work[: 3 * count * width].reshape(3, count, width)
-        )
+        return product_of_thirds(lefts, right, work[: 3 * count * width].reshape(3, count, width))
 
     def _right(self, factor: np.ndarray) -> tuple[np.ndarray, ...]:
         """(node, term) complex as the right-hand side of one real product, (term x (real,

@@ -73,9 +73,11 @@ def test_a_product_is_compressed_elsewhere(other, symmetric):
     rank = np.count_nonzero(np.cumsum(np.linalg.svd(full)[1][::-1] ** 2) > cut**2)
     sparse = csr_array(np.diag(weights).astype(complex))
     for coupling in (np.diag(weights).astype(complex), sparse):
-        factors = [left, left], [right, right]
+        high = np.hstack([left, left])
+        wide = high if symmetric else np.hstack([right, right])
         halves = {(0, 0): coupling / 2, (1, 1): coupling / 2}
-        one = Product(factors[0], factors[0] if symmetric else factors[1], halves, symmetric, other)
+        terms = [90, 90], [90, 90]
+        one = Product(high, wide, halves, symmetric, other, terms)
         high, wide = one.factors(cut, 12)
         assert isinstance(high, np.ndarray) and high.shape[1] <= rank + 1
         assert np.linalg.norm(high @ wide.T - full) < 1.5 * cut

@@ -521,7 +521,7 @@ def _random_product(rng, rows, terms, decay):
 def test_compression_keeps_what_was_asked():
     rng = np.random.default_rng(5)
     left, right, core = _random_product(rng, 90, 60, 0.3)
-    high, wide = product.Product([left], [right], {(0, 0): core}, False).factors(1e-2, 10)
+    high, wide = product.Product(left, right, {(0, 0): core}, False).factors(1e-2, 10)
     full = left @ core @ right.T
     assert np.linalg.norm(high @ wide.T - full) < 1.5e-2
     singular = np.linalg.svd(full, compute_uv=False)
@@ -543,7 +543,7 @@ def test_a_spanned_product_keeps_what_was_asked(symmetric, begun, three, monkeyp
     right = left if symmetric else right
     full = left @ core @ right.T
     cut = 1e-3 * np.linalg.norm(full)
-    high, wide = product.Product([left], [right], {(0, 0): core}, symmetric).spanned(cut, begun)
+    high, wide = product.Product(left, right, {(0, 0): core}, symmetric).spanned(cut, begun)
     assert np.linalg.norm(high @ wide.T - full) < 1.1 * cut
     assert np.allclose(high.conj().T @ high, np.eye(high.shape[1]))
     singular = np.linalg.svd(full, compute_uv=False)
@@ -603,7 +603,7 @@ def test_a_product_of_few_terms_is_narrowed_in_single_precision(symmetric):
     )
     right = left if symmetric else right
     cut = 1e-5 * np.linalg.norm(core)
-    x, y, k = product.Product([left], [right], {(0, 0): core}, symmetric).narrowed(cut)
+    x, y, k = product.Product(left, right, {(0, 0): core}, symmetric).narrowed(cut)
     full = left.astype(complex) @ core @ right.T.astype(complex)
     terms = np.count_nonzero(
         np.sqrt(np.cumsum(np.linalg.svd(full, compute_uv=False)[::-1] ** 2))[::-1] > cut
@@ -619,7 +619,7 @@ def test_a_product_of_few_terms_is_narrowed_in_single_precision(symmetric):
 def test_a_product_of_many_terms_is_left_as_it_is():
     left, right, core = _random_product(np.random.default_rng(8), 900, 300, 0.01)
     assert (
-        product.Product([left], [right], {(0, 0): core}, False).narrowed(
+        product.Product(left, right, {(0, 0): core}, False).narrowed(
             1e-3 * np.linalg.norm(core)
         )
         is None
@@ -630,9 +630,9 @@ def test_too_many_terms_are_refused(monkeypatch):
     monkeypatch.setattr(product, "MAX_SKETCH", 20)
     left, right, core = _random_product(np.random.default_rng(6), 90, 60, 0.01)
     with pytest.raises(NumericsError, match="separable terms"):
-        product.Product([left], [right], {(0, 0): core}, False).factors(1e-3, 10)
+        product.Product(left, right, {(0, 0): core}, False).factors(1e-3, 10)
     with pytest.raises(NumericsError, match="separable terms"):
-        product.Product([left], [right], {(0, 0): core}, False).spanned(1e-3, 10)
+        product.Product(left, right, {(0, 0): core}, False).spanned(1e-3, 10)
 
 
 def test_refusals():

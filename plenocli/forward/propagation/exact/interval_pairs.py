@@ -37,6 +37,8 @@ if TYPE_CHECKING:
 
 ROWS_AT_ONCE = 256
 """Rows whose squares are added up together, so that sums in single precision stay short."""
+AT_ONCE = 1 << 19
+"""Numbers of a field that are brought to pixels together: they stay in the caches."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,6 +77,11 @@ class SensorSide:
     def lines(self) -> int:
         """How many numbers carry the field of one point."""
         return len(self.u if self.modes is None else self.modes.weighted)
+
+    @property
+    def shown(self) -> int:
+        """How many numbers show the field of all points on the pixels' nodes."""
+        return len(self.points) * len(self.u if self.modes is None else self.modes.pixels)
 
     def carry(self, wave: np.ndarray) -> np.ndarray:
         """A kernel (nodes, x), roots of weights folded in, as (lines, x)."""
@@ -167,24 +174,36 @@ class Interval:
         """Path (m) to u from the middle of this lenslet; other: as `wave`."""
         return path(self.offset + u, self.geometry.z3, self.offset, other)
 
-    def on_pixels(self, factor: np.ndarray, other: float) -> np.ndarray:
-        """What modes of the sensor's side carry, as (pixels' nodes x points, terms).
+    def on_pixels(
+        self, factor: np.ndarray, other: float, out: np.ndarray | None = None
+    ) -> np.ndarray:
+        """What modes of the sensor's side carry, on the nodes of the pixels.
 
         factor: (lines x points, terms);
-        other: as `wave`.
+        other: as `wave`;
+        out: where it is put, None: an array of its own.
+
+        Returns (pixels' nodes x points, terms).
         """
-        modes = self.side.modes
+        modes, terms = self.side.modes, factor.shape[1]
         if modes is None:
-            return factor
-        real, shape = factor.real.dtype, (self.side.lines, -1)
+            if out is None:
+                return factor
+            out[:] = factor
+            return out
+        shown = modes.shown.astype(factor.real.dtype)
         # singular vectors may lie column by column
-        factor = np.ascontiguousarray(factor)
-        wide = modes.shown.astype(real) @ factor.reshape(shape).view(real)
-        wide = wide.view(factor.dtype)
+        carried = np.ascontiguousarray(factor).reshape(self.side.lines, -1).view(shown.dtype)
         apart = self._from_middle(modes.pixels, other) - self._own_path(modes.pixels)
-        if apart.any():
-            wide *= np.exp(1j * self.geometry.k * apart).astype(factor.dtype)[:, None]
-        return wide.reshape(-1, factor.shape[1])
+        turned = np.exp(1j * self.geometry.k * apart).astype(factor.dtype)[:, None, None]
+        if out is None:
+            out = np.empty((self.side.shown, terms), factor.dtype)
+        nodes, step = out.reshape(len(shown), -1, terms), max(1, AT_ONCE // carried.shape[1])
+        for start in range(0, len(shown), step):  # fresh pages take longer than what is moved
+            some = slice(start, start + step)
+            part = (shown[some] @ carried).view(factor.dtype).reshape(-1, *nodes.shape[1:])
+            np.multiply(part, turned[some], out=nodes[some])
+        return out
 
     def _incoming(self) -> np.ndarray:
         """Path (m) of the main lens's wave along this axis on the lenslet's nodes: off the axis of

@@ -179,6 +179,29 @@ class _Lit:
         """The lenslet that brings most."""
         return list(self.kept)[-1]
 
+    @property
+    def alone(self) -> bool:
+        """Whether there is only one."""
+        return len(self.kept) == 1
+
+
+_Part = tuple[np.ndarray, Interval, float]
+"""What a lenslet brings along one axis: (lines x points, terms), the Interval, and how far aside
+the superpixel is along the other (m)."""
+
+
+def _side_by_side(parts: Sequence[_Part], alone: bool) -> np.ndarray:
+    """Terms of all parts, (rows, terms): on what carries a lenslet alone, or where lenslets
+    interfere, on the pixels.
+    """
+    if alone:
+        return parts[0][0] if len(parts) == 1 else np.concatenate([p[0] for p in parts], axis=1)
+    ends = np.cumsum([factor.shape[1] for factor, _, _ in parts])
+    out = np.empty((parts[0][1].side.shown, ends[-1]), parts[0][0].dtype)
+    for end, (factor, interval, other) in zip(ends, parts):
+        interval.on_pixels(factor, other, out[:, end - factor.shape[1] : end])
+    return out
+
 
 class ExactSquareLenslets(LensletFields):
     """Sensor fields behind square lenslets by the exact kernel; see the module."""
@@ -444,30 +467,37 @@ class ExactSquareLenslets(LensletFields):
         weak = 2 * lit.cut if lit.spanned else tolerance / 2
         x, y, coupling = pair.factors(max(self._extent), tolerance, weak)
         if key != lit.brightest:  # its own rank may be far lower
-            one = Product([x], [y], {(0, 0): coupling}, pair.symmetric, self.device)
+            one = Product(x, y, {(0, 0): coupling}, pair.symmetric, self.device)
             x, y, coupling = one.narrowed(lit.narrowing * each) or (x, y, coupling)
-        if len(lit.kept) > 1:  # lenslets interfere on the pixels
-            x, y = pair.on_pixels(x, y)
         lit.parts[key] = x, y, coupling
 
-    def _joined(self, lit: _Lit) -> tuple[Factors, int]:
-        """Factors of a superpixel, and the pairs of terms that they are compressed from."""
-        left: list[np.ndarray] = []
-        right: list[np.ndarray] = []
+    def _together(self, lit: _Lit) -> Product:
+        """What all lenslets bring to a superpixel."""
+        left: list[_Part] = []
+        right: list[_Part] = []
         couplings: dict[tuple[int, int], Matrix] = {}
         for (m, n), pair in lit.kept.items():
             x, y, coupling = lit.parts.pop((m, n))
+            row, column = (x, pair.row, pair.column.offset), (y, pair.column, pair.row.offset)
             first = len(left)
             # the lenslet mirrored by the diagonal brings the transpose
             if lit.symmetric and not pair.symmetric:
-                left += [x, y]
+                left += [row, column]
                 half = coupling if m != n else coupling / 2
                 couplings |= {(first, first + 1): half, (first + 1, first): half.T}
             else:
-                left, right = [*left, x], [*right, y]
+                left, right = [*left, row], [*right, column]
                 couplings[first, first] = coupling
         right = left if lit.symmetric else right
-        product = Product(left, right, couplings, lit.symmetric, self.device)
+        terms = [part[0].shape[1] for part in left], [part[0].shape[1] for part in right]
+        high = _side_by_side(left, lit.alone)
+        wide = high if lit.symmetric else _side_by_side(right, lit.alone)
+        return Product(high, wide, couplings, lit.symmetric, self.device, terms)
+
+    def _joined(self, lit: _Lit) -> tuple[Factors, int]:
+        """Factors of a superpixel, and the pairs of terms that they are compressed from."""
+        product = self._together(lit)
+        products = product.left.shape[1]
         high, wide = (
             product.spanned(lit.whole, lit.guess)
             if lit.spanned
@@ -476,7 +506,7 @@ class ExactSquareLenslets(LensletFields):
         (sy, sx), beside = lit.at, all(lit.at)
         sides = self._sensor_side(sy, 0, beside), self._sensor_side(sx, 1, beside)
         shown = None
-        if len(lit.kept) == 1:  # of one lenslet's path no energy tells
+        if lit.alone:  # of one lenslet's path no energy tells
             shown = self._modes_shown(sides, high.shape[1])
             if not shown:
                 high, wide = lit.kept[lit.brightest].on_pixels(high, wide)
@@ -487,7 +517,7 @@ class ExactSquareLenslets(LensletFields):
             self.band.pixel_nodes,
             shown=shown,
             device=self.device,
-        ), sum(x.shape[1] for x in left)
+        ), products
 
     def _modes_shown(
         self, sides: tuple[SensorSide, SensorSide], terms: int

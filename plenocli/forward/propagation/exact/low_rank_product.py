@@ -45,76 +45,69 @@ MAX_SKETCH = 2500
 
 
 class Product:
-    """left, right: lists of X_a (rows, terms) and X_b (columns, terms);
+    """left, right: X_a and X_b side by side, (rows, terms of all) and (columns, terms of all);
     couplings: {(a, b): K_ab}, at least one for each factor;
     symmetric: whether M^T = M, with the same factors on both sides;
-    device: where it is compressed.
+    device: where it is compressed;
+    terms: how many each X_a and each X_b has; None: there is one of either.
     """
 
     def __init__(
         self,
-        left: list[np.ndarray],
-        right: list[np.ndarray],
+        left: np.ndarray,
+        right: np.ndarray,
         couplings: Mapping[tuple[int, int], Matrix],
         symmetric: bool,
         device: Device = CPU,
+        terms: tuple[Sequence[int], Sequence[int]] | None = None,
     ) -> None:
         self.device, self.symmetric = device, symmetric
-        self.left = [device.put(x) for x in left]
-        self.right = self.left if right is left else [device.put(x) for x in right]
+        self.left = device.put(left)
+        self.right = self.left if right is left else device.put(right)
+        self._places = [_places(n) for n in terms or ([left.shape[1]], [right.shape[1]])]
         self.couplings = {key: _put_thin(device, k) for key, k in couplings.items()}
-        self.limit = min(len(left[0]), len(right[0]))
+        self.limit = min(len(left), len(right))
         self.rng = np.random.default_rng(20130701)
 
-    def _through(self, side: int, blocks: list[Any]) -> list[Any]:
-        """The couplings times blocks (terms, t) of the other side's factors: list of (terms, t)
-        for this side's (0 left, 1 right).
+    def _through(self, side: int, seen: Any) -> Any:
+        """The couplings times what the other side's factors see (term, t): (term, t) for this
+        side's (0 left, 1 right).
         """
-        if side == 0:
-            return [
-                sum(k @ blocks[b] for (i, b), k in self.couplings.items() if i == a)
-                for a in range(len(self.left))
-            ]
-        return [
-            sum(k.T @ blocks[a] for (a, i), k in self.couplings.items() if i == b)
-            for b in range(len(self.right))
+        mine, others = self._places[side], self._places[1 - side]
+        through = [
+            (pair[side], (k.T if side else k) @ seen[others[pair[1 - side]], :])
+            for pair, k in self.couplings.items()
         ]
+        sums = [sum(found for n, found in through if n == number) for number in range(len(mine))]
+        return self.device.xp.concat(sums, axis=0)
 
-    def _times(self, side: int, seen: list[Any]) -> Any:
+    def _times(self, side: int, seen: Any) -> Any:
         """M (side 0) or M^T (1) times combinations of its columns, given as what the other
         side's factors make of them: (rows, combinations).
         """
-        mine = self.right if side else self.left
-        if self.device.xp is not np:
-            return sum(x @ y for x, y in zip(mine, self._through(side, seen)))
-        out = np.zeros((len(mine[0]), seen[0].shape[1]), mine[0].dtype)
-        for x, y in zip(mine, self._through(side, seen)):
-            _add_product(out, x, y)
-        return out
+        return _product(self.right if side else self.left, self._through(side, seen))
 
-    def _mixed(self, side: int, count: int) -> list[Any]:
-        """X^T Omega for each factor X of a side, Omega (rows, count) random combinations of
+    def _mixed(self, side: int, count: int) -> Any:
+        """X^T Omega for the factors X of a side, Omega (rows, count) random combinations of
         rows, every one of which goes into one of them.
         """
         factors = self.right if side else self.left
-        rows = factors[0].shape[0]
+        rows = factors.shape[0]
         order, signs = self.rng.permutation(rows), self.rng.choice([-1.0, 1.0], rows)
-        return [_combined(x, order, signs, count) for x in factors]
+        return _combined(factors, order, signs, count)
 
-    def _through_basis(self, q: Any) -> list[Any]:
-        """What is seen of M through orthonormal columns q: X_a^T q* for each factor where M is
-        symmetric, else M^T q* alone.
+    def _through_basis(self, q: Any) -> Any:
+        """What is seen of M through orthonormal columns q: X^T q* of the factors where M is
+        symmetric, else M^T q*.
         """
         seen = self._seen(q)
-        return seen if self.symmetric else [self._times(1, seen)]
+        return seen if self.symmetric else self._times(1, seen)
 
-    def _seen(self, q: Any) -> list[Any]:
-        """X_a^T q* for each factor."""
-        turned = self.device.xp.conj(q)
-        parts = thirds(turned) if isinstance(q, np.ndarray) and np.iscomplexobj(q) else ()
-        return [_product(x.T, turned, parts) for x in self.left]
+    def _seen(self, q: Any) -> Any:
+        """X^T q* of the factors."""
+        return _product(self.left.T, self.device.xp.conj(q))
 
-    def _extend(self, q: Any | None, seen: list[Any] | None, count: int) -> tuple[Any, list[Any]]:
+    def _extend(self, q: Any | None, seen: Any | None, count: int) -> tuple[Any, Any]:
         """The basis q of M's range (None: not begun) with columns added up to `count`, and what
         is seen of M through it.
         """
@@ -125,14 +118,14 @@ class Product:
             return q, self._through_basis(q)
         xp, columns = self.device.xp, self._times(0, self._mixed(1, count - q.shape[1]))
         new, _ = _beside_basis(q, columns)
-        added = [xp.concat(pair, axis=1) for pair in zip(seen, self._through_basis(new))]
-        return xp.concat([q, new], axis=1), added
+        seen = xp.concat([seen, self._through_basis(new)], axis=1)
+        return xp.concat([q, new], axis=1), seen
 
-    def _core(self, q: Any, seen: list[Any]) -> tuple[Any, Any]:
+    def _core(self, q: Any, seen: Any) -> tuple[Any, Any]:
         """(P, K) with Q Q^H M = Q K P^T, P orthonormal and Q where M is symmetric."""
         if self.symmetric:
-            return q, sum(o.T @ c for o, c in zip(seen, self._through(0, seen)))
-        p, triangle = _triangle(seen[0])
+            return q, seen.T @ self._through(0, seen)
+        p, triangle = _triangle(seen)
         return p, triangle.T
 
     def factors(
@@ -204,30 +197,30 @@ class Product:
         Returns (X, Y, K), X orthonormal and Y = X where M is symmetric; None where M does not have
         so few terms, or its factors have few enough.
         """
-        given, home = sum(x.shape[1] for x in self.left), self.device.get
+        given, home = self.left.shape[1], self.device.get
         if given <= SMALL or given // NARROW[-1] >= self.limit:
             return None
         tried = (self._directions(cut, given // part) for part in NARROW)
-        directions = next((found for found in tried if found), None)
+        directions = next((found for found in tried if found is not None), None)
         if directions is None:
             return None
         x = orthonormal(self._times(0, directions))
         seen = self._through_basis(x)
-        y, core = self._core(x, seen) if self.symmetric else (seen[0], _like(x, np.eye(x.shape[1])))
+        y, core = self._core(x, seen) if self.symmetric else (seen, _like(x, np.eye(x.shape[1])))
         if self._missed(x, core, y) > 2 * cut:
             return None
         here = home(x)
         return here, here if y is x else home(y), home(core)
 
-    def _directions(self, cut: float, count: int) -> list[Any] | None:
-        """Combinations of M's columns that span its range up to `cut`, as X_b^T times them for each
-        factor; None where that takes nearly `count` or more. Found where M is small: through random
+    def _directions(self, cut: float, count: int) -> Any | None:
+        """Combinations of M's columns that span its range up to `cut`, as X^T times them of the
+        right factors; None where that takes nearly `count` or more. Found where M is small: through random
         combinations of its rows and of its columns, OVER times as many.
         """
         many = min(OVER * count, self.limit)
         right = self._mixed(1, many)
         left = right if self.symmetric else self._mixed(0, many)
-        core = sum(m.T @ c for m, c in zip(left, self._through(0, right)))
+        core = left.T @ self._through(0, right)
         # a step of a power iteration, which parts large values from small ones
         linalg = self.device.xp.linalg
         basis = orthonormal(core @ _like(core, self.rng.choice([-1.0, 1.0], (many, count))))
@@ -241,15 +234,14 @@ class Product:
         if terms > FILL * count:
             return None
         basis = basis @ _adjoint(vh[: min(count, int(terms / FILL) + 8), :])
-        return [m @ basis for m in right]
+        return right @ basis
 
     def _missed(self, x: Any, core: Any, y: Any) -> float:
         """Root sum of squares of M - X K Y^T, estimated on random entries."""
         xp, sides = self.device.xp, (self.left, self.right)
-        rows, columns = (beside(x, self.rng.integers(0, side[0].shape[0], 64)) for side in sides)
-        some = [xp.take(b, columns, axis=0).T for b in self.right]
-        pairs = zip(self.left, self._through(0, some))
-        exact = sum(xp.take(a, rows, axis=0) @ c for a, c in pairs)
+        rows, columns = (beside(x, self.rng.integers(0, side.shape[0], 64)) for side in sides)
+        some = self._through(0, xp.take(self.right, columns, axis=0).T)
+        exact = xp.take(self.left, rows, axis=0) @ some
         told = xp.take(x, rows, axis=0) @ core @ xp.take(y, columns, axis=0).T
         mean = float(xp.mean(xp.abs(exact - told) ** 2))
         return math.sqrt(mean * x.shape[0] * y.shape[0])
@@ -291,30 +283,24 @@ def _terms_of_all(high: np.ndarray, wide: np.ndarray, worst: np.ndarray) -> int:
     return max(1, int(np.count_nonzero((lost > worst**2).any(axis=(1, 2)))))
 
 
-def _product(x: Any, y: Any, parts: Sequence[np.ndarray] = ()) -> Any:
-    """x @ y; parts: thirds of y, where they are known."""
-    if not isinstance(x, np.ndarray):
+def _places(terms: Sequence[int]) -> list[slice]:
+    """Of each factor's terms among those of all."""
+    ends = np.cumsum(terms).tolist()
+    return [slice(end - n, end) for n, end in zip(terms, ends)]
+
+
+def _product(x: Any, y: Any) -> Any:
+    """x @ y; large ones of NumPy by three real products, rows at a time."""
+    if not isinstance(x, np.ndarray) or min(*x.shape, y.shape[1]) < THREE_SERVE:
         return x @ y
-    out = np.zeros((len(x), y.shape[1]), x.dtype)
-    _add_product(out, x, y, parts)
-    return out
-
-
-def _add_product(
-    out: np.ndarray, x: np.ndarray, y: np.ndarray, parts: Sequence[np.ndarray] = ()
-) -> None:
-    """out += x @ y, rows at a time, so that no second array of its size is needed."""
-    three = np.iscomplexobj(x) and np.iscomplexobj(y) and min(*x.shape, y.shape[1]) >= THREE_SERVE
-    parts = parts or thirds(y) if three else ()
-    work = np.empty((3, min(ROWS, len(x)), y.shape[1]), y.real.dtype) if three else out
+    if not (np.iscomplexobj(x) and np.iscomplexobj(y)):
+        return x @ y
+    out = np.empty((len(x), y.shape[1]), x.dtype)
+    parts, work = thirds(y), np.empty((3, min(ROWS, len(x)), y.shape[1]), x.real.dtype)
     for start in range(0, len(x), ROWS):
         part, target = x[start : start + ROWS], out[start : start + ROWS]
-        if three:
-            real, imaginary = product_of_thirds(thirds(part), parts, work[:, : len(part)])
-            target.real += real
-            target.imag += imaginary
-        else:
-            target += part @ y
+        target.real, target.imag = product_of_thirds(thirds(part), parts, work[:, : len(part)])
+    return out
 
 
 def thin(matrix: np.ndarray) -> Matrix:

@@ -123,7 +123,7 @@ def oblique_field(
     unit = np.eye(len(matrix), dtype=matrix.dtype)
     # at an end of its interval a polynomial may be `orders` times its root mean square
     cut = tolerance / orders
-    factors = Product([matrix], [unit], {(0, 0): unit}, False).factors(cut, SKETCH)
+    factors = Product(matrix, unit, {(0, 0): unit}, False).factors(cut, SKETCH)
     project = legendre(t, count, 1).T * w * ((2 * np.arange(count) + 1) / 2)[:, None]
     onto = _of_points(places, orders).T * np.sqrt(share / 2)
     rows, columns = (

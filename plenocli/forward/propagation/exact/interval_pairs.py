@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -95,7 +95,8 @@ class Interval:
     """From lenslet m to superpixel s along one axis.
 
     `place`: the lenslet's nodes x (m) from the axis;
-    terms: LocalTerms there.
+    terms: LocalTerms there;
+    weigh: R with R^H R the overlaps of what they bring to the superpixel.
 
     f: focal length of a hyperbolic lenslet, None for a parabolic one;
     tolerance: root energy by which the field may miss.
@@ -135,6 +136,8 @@ class Interval:
         values = (values * side.emphasis[:, None]).transpose(0, 2, 1)  # (x, term, point)
         kind = dtype if np.iscomplexobj(values) else dtype.type().real.dtype
         self.values = np.ascontiguousarray(values, kind)
+        power, vectors = np.linalg.eigh(self._gram())
+        self.weigh = np.sqrt(np.maximum(power, 0))[:, None] * vectors.conj().T
 
     def _slope(self, middle: float, half: float) -> float:
         """Largest slope (rad/m) of the integrand's phase: of the way to either end of the
@@ -223,8 +226,7 @@ class Interval:
         far = self.geometry.z2**2 + self.chief_across**2
         return (far + self.chief**2) / (far + (self.chief + self.place) ** 2)
 
-    @cached_property
-    def gram(self) -> np.ndarray:
+    def _gram(self) -> np.ndarray:
         """Overlaps, for a mean point, of what each term alone brings to the superpixel through
         the separable part: (term, term).
         """
@@ -237,12 +239,6 @@ class Interval:
             gram += line.conj() @ line.T
         gram /= points
         return gram if np.iscomplexobj(self.values) else gram.real
-
-    @cached_property
-    def weigh(self) -> np.ndarray:
-        """R with R^H R = gram."""
-        values, vectors = np.linalg.eigh(self.gram)
-        return np.sqrt(np.maximum(values, 0))[:, None] * vectors.conj().T
 
     def sheet(
         self,

@@ -241,7 +241,8 @@ class ExactSquareLenslets(LensletFields):
             self._meet_all(largest_first)
             for start in range(0, len(largest_first), plan.at_once):
                 some = [self._lit(*at) for at in largest_first[start : start + plan.at_once]]
-                spread([(lit, key) for lit in some for key in lit.kept], self._follow)
+                # the brightest lenslets take longest
+                spread([(lit, key) for lit in some for key in reversed(lit.kept)], self._follow)
                 spread([(lit,) for lit in some], join)
         self._intervals = {}
         self.notes = FieldNotes(

@@ -619,9 +619,7 @@ def test_a_product_of_few_terms_is_narrowed_in_single_precision(symmetric):
 def test_a_product_of_many_terms_is_left_as_it_is():
     left, right, core = _random_product(np.random.default_rng(8), 900, 300, 0.01)
     assert (
-        product.Product(left, right, {(0, 0): core}, False).narrowed(
-            1e-3 * np.linalg.norm(core)
-        )
+        product.Product(left, right, {(0, 0): core}, False).narrowed(1e-3 * np.linalg.norm(core))
         is None
     )
 

@@ -214,8 +214,8 @@ class Product:
 
     def _directions(self, cut: float, count: int) -> Any | None:
         """Combinations of M's columns that span its range up to `cut`, as X^T times them of the
-        right factors; None where that takes nearly `count` or more. Found where M is small: through random
-        combinations of its rows and of its columns, OVER times as many.
+        right factors; None where that takes nearly `count` or more. Found where M is small:
+        through random combinations of its rows and of its columns, OVER times as many.
         """
         many = min(OVER * count, self.limit)
         right = self._mixed(1, many)

@@ -113,17 +113,18 @@ class Factors:
         rows, columns: (point,) indices;
         out: (point, pixel row, pixel column), filled.
         """
-        real = self.high.real.dtype
-        lines = self.high.shape[2]
-        (py, px), nodes = self.pixel_shape, self.pixel_nodes
-        step = max(1, round(WORK_BYTES / (lines * 2 * self.wide.shape[2] * real.itemsize)))
-        work = np.empty((3 if self._thirds else 2) * step * lines * self.wide.shape[2], real)
         order = np.argsort(columns, kind="stable")
         starts = np.flatnonzero(np.diff(columns[order]) > 0) + 1
-        for group in np.split(order, starts):
-            if self.device.xp is not np:
+        groups = np.split(order, starts)
+        if self.device.xp is not np:
+            for group in groups:
                 out[group] = self._elsewhere(sy, sx, rows[group], columns[group[0]])
-                continue
+            return
+        real, lines, width = self.high.real.dtype, self.high.shape[2], self.wide.shape[2]
+        (py, px), nodes = self.pixel_shape, self.pixel_nodes
+        step = max(1, round(WORK_BYTES / (lines * 2 * width * real.itemsize)))
+        work = np.empty((3 if self._thirds else 2) * step * lines * width, real)
+        for group in groups:
             right = self._right(self.wide[sx, columns[group[0]]])
             for start in range(0, len(group), step):
                 part = group[start : start + step]

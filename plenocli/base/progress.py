@@ -20,6 +20,17 @@ _COLLECTED: contextvars.ContextVar[list[str] | None] = contextvars.ContextVar(
 )
 
 
+@contextlib.contextmanager
+def hushed(silent: bool = True) -> Iterator[None]:
+    """While the block lasts no bars and no notes, or both where not `silent`."""
+    global quiet
+    before, quiet = quiet, silent
+    try:
+        yield
+    finally:
+        quiet = before
+
+
 def bar(iterable: Iterable | None, total: int | None = None, label: str = "") -> Any:
     """Wrap an iterable so that a terminal shows how far it is and how long it will take.
 

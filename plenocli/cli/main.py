@@ -80,7 +80,7 @@ def cli(ctx: click.Context, quiet: bool, verbose: bool) -> None:
     """
     from plenocli.base import progress
 
-    progress.quiet = quiet
+    ctx.with_resource(progress.hushed(quiet))
     if verbose:
         ctx.call_on_close(partial(_cost, time.monotonic()))
     if ctx.invoked_subcommand is None:

@@ -1,9 +1,10 @@
 """Bars that nobody sees go over what they are given all the same."""
 
 import numpy as np
+import pytest
 
-from plenocli.base import progress
 from plenocli.base.progress import bar, collected_notes, note, repeats_counted
+from plenocli.cli.main import run
 
 
 def test_a_silent_bar_takes_arrays_and_nothing():
@@ -12,8 +13,14 @@ def test_a_silent_bar_takes_arrays_and_nothing():
         assert list(bar([])) == [] and list(bar(None, 3)) == []
 
 
-def test_notes_that_repeat_are_counted(capsys, monkeypatch):
-    monkeypatch.setattr(progress, "quiet", False)
+@pytest.mark.parametrize("command, code", [(["schema", "camera"], 0), (["inspect", "none.h5"], 3)])
+def test_silence_ends_with_the_command(command, code, capsys):
+    assert run(["--quiet", *command]) == code
+    note("told afterwards")
+    assert capsys.readouterr().err.endswith("plenocli: told afterwards\n")
+
+
+def test_notes_that_repeat_are_counted(capsys):
     with repeats_counted():
         for number in range(45):
             note(f"a{number}.nef: {number} of 90 lenslets lie partly off the sensor")

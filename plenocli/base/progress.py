@@ -21,8 +21,8 @@ _COLLECTED: contextvars.ContextVar[list[str] | None] = contextvars.ContextVar(
 
 
 @contextlib.contextmanager
-def hushed(silent: bool = True) -> Iterator[None]:
-    """While the block lasts no bars and no notes, or both where not `silent`."""
+def hushed(silent: bool) -> Iterator[None]:
+    """Whether there are no bars and no notes, until the block ends."""
     global quiet
     before, quiet = quiet, silent
     try:

@@ -269,7 +269,7 @@ class PifBuilder:
         total = np.zeros(self.object_shape)
         for first, members in self.orbits():
             one = _OneSuperpixel(self, first, A[first])
-            spread(one.parts[::-1], one.compute)  # the longest first
+            spread(one.parts, one.compute)
             share = one.complete()
             for index, how in members:
                 total += turned_planes(share[None, None], how)[0, 0]
@@ -295,7 +295,7 @@ class PifBuilder:
         total = np.zeros(self.object_shape)
         for first, members in self.orbits():
             one = _OneSuperpixel(self, first, slab)
-            spread(one.parts[::-1], one.compute)  # the longest first
+            spread(one.parts, one.compute)
             share = one.complete()
             for index, how in members:
                 total += turned_planes(share[None, None], how)[0, 0]
@@ -423,11 +423,11 @@ class _OneSuperpixel:
         self._share = np.empty((oy, ox))
         self._energies = builder.lenslets.on_superpixel(sy, sx)
         # a cache line of points at a time; where columns differ in length, fewer,
-        # for threads to share
+        # for threads to share, the longest first
         step = 8 if self._turn else 16
         self.parts = [
             (start, min(start + step, self._columns)) for start in range(0, self._columns, step)
-        ]
+        ][::-1]
 
     def compute(self, start: int, stop: int) -> None:
         """Point columns start to stop, all the rows that no symmetry gives."""

@@ -79,7 +79,7 @@ class SensorSide:
         return len(self.u if self.modes is None else self.modes.weighted)
 
     @property
-    def shown(self) -> int:
+    def pixel_rows(self) -> int:
         """How many numbers show the field of all points on the pixels' nodes."""
         return len(self.points) * len(self.u if self.modes is None else self.modes.pixels)
 
@@ -200,7 +200,7 @@ class Interval:
         apart = self._from_middle(modes.pixels, other) - self._own_path(modes.pixels)
         turned = np.exp(1j * self.geometry.k * apart).astype(factor.dtype)[:, None, None]
         if out is None:
-            out = np.empty((self.side.shown, terms), factor.dtype)
+            out = np.empty((self.side.pixel_rows, terms), factor.dtype)
         nodes, step = out.reshape(len(shown), -1, terms), max(1, AT_ONCE // carried.shape[1])
         for start in range(0, len(shown), step):  # fresh pages take longer than what is moved
             some = slice(start, start + step)

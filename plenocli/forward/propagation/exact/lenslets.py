@@ -197,7 +197,7 @@ def _side_by_side(parts: Sequence[_Part], alone: bool) -> np.ndarray:
     if alone:
         return parts[0][0] if len(parts) == 1 else np.concatenate([p[0] for p in parts], axis=1)
     ends = np.cumsum([factor.shape[1] for factor, _, _ in parts])
-    out = np.empty((parts[0][1].side.shown, ends[-1]), parts[0][0].dtype)
+    out = np.empty((parts[0][1].side.pixel_rows, ends[-1]), parts[0][0].dtype)
     for end, (factor, interval, other) in zip(ends, parts):
         interval.on_pixels(factor, other, out[:, end - factor.shape[1] : end])
     return out

@@ -61,27 +61,35 @@ class Budget:
                 f"{fewer}, or raise --mem-limit to {size_text(1.05 * needed)}",
             )
 
-    def require_reading(self, path: str | os.PathLike, needed: float) -> None:
+    def require_reading(self, path: str | os.PathLike, needed: float, why: str = "") -> None:
         """NumericsError where reading the file at `path` takes more than there is.
 
         needed: bytes.
+        why: of that, for the message.
         """
         if needed > self.memory:
             raise NumericsError(
                 f"needs about {size_text(needed)} to be read, more than the limit of "
-                f"{size_text(self.memory)}",
+                f"{size_text(self.memory)}{why}",
                 path,
                 f"raise --mem-limit to {size_text(1.05 * needed)}",
             )
 
     def require_declared(
-        self, path: str | os.PathLike, declared: int, needed: float, part: str = ""
+        self,
+        path: str | os.PathLike,
+        declared: int,
+        needed: float,
+        part: str = "",
+        *,
+        why: str = "",
     ) -> None:
         """Refuse a file before its values are read, where they do not fit.
 
         declared: bytes of values that its header declares.
         needed: bytes that reading them takes.
         part: up to where in the file, for the message.
+        why: reading takes so much, likewise.
 
         Raises NumericsError where memory is all that is missing, InputError where the file is far
         too small for what it declares.
@@ -96,7 +104,7 @@ class Budget:
                 path,
                 "make or copy it again; it is damaged, or made to fill the memory",
             )
-        self.require_reading(path, needed)
+        self.require_reading(path, needed, why)
 
 
 def machine_budget() -> Budget:

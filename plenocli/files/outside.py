@@ -23,7 +23,7 @@ import sys
 import threading
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Generator, Iterator
 from io import BufferedReader
 from typing import Any, NoReturn
 
@@ -60,40 +60,87 @@ def outside(
     Raises the PlenoError of the function, InputError where the file crashed the child or took it
     beyond its limits, MemoryError.
     """
+    ask = _asked(function, path, arguments, seconds)
+    child, answer = _first(ask, path)
+    if answer.get("more"):
+        child.end(0)
+        raise InputError(_what_happened(0, ValueError()), path, _FIX)
+    _rests(child, answer, function)
+    return _value(answer, path, ask)
+
+
+def outside_in_parts(
+    function: Callable[..., Any],
+    path: str | os.PathLike,
+    *arguments: Any,
+    seconds: int | None = None,
+) -> Iterator[Any]:
+    """As `outside`, of a function that yields: each part when it is asked for, so that neither
+    process holds more than one or two of them.
+    """
+    ask = _asked(function, path, arguments, seconds)
+    child, answer = _first(ask, path)
+    while answer.get("more"):
+        try:
+            yield _value(answer, path, ask)
+            answer = child.hear()
+        except TimeoutError:
+            raise _too_late(child, path) from None
+        except (OSError, EOFError, ValueError, KeyError, TypeError) as error:
+            raise InputError(_what_happened(child.end(1), error), path, _FIX) from None
+        except BaseException:  # nobody asks for the rest
+            child.end(0)
+            raise
+    _rests(child, answer, function)
+    _value(answer, path, ask)
+
+
+def _asked(
+    function: Callable[..., Any],
+    path: str | os.PathLike,
+    arguments: tuple[Any, ...],
+    seconds: int | None,
+) -> list[Any]:
+    """What a child is told: seconds, module, function, name of the file, arguments."""
     name = os.fspath(path)
     with contextlib.suppress(FileNotFoundError):  # the working directory is gone
         name = os.path.abspath(name)
-    ask = [
-        seconds or CPU_S,
-        function.__module__,
-        function.__qualname__,
-        os.fsdecode(name),
-        *arguments,
-    ]
+    told = [seconds or CPU_S, function.__module__, function.__qualname__, os.fsdecode(name)]
+    return [*told, *arguments]
+
+
+def _first(ask: list[Any], path: str | os.PathLike) -> tuple[_Child, dict[str, Any]]:
+    """A child, and its first answer."""
     while True:
         try:
             child, is_new = _taken()
         except PlenoError as error:
             raise error.at(path) from error
         try:
-            answer = child.ask(ask)
+            return child, child.ask(ask)
         except TimeoutError:
-            child.end(0)
-            raise InputError(f"was not decoded within {TIMEOUT_S:g} s", path, _FIX) from None
+            raise _too_late(child, path) from None
         except (OSError, EOFError, ValueError, KeyError, TypeError) as error:
             code = child.end(1)
             # else a file before may have left it broken
             if is_new or code == -signal.SIGXCPU:
                 raise InputError(_what_happened(code, error), path, _FIX) from None
-            continue
         except BaseException:  # half of an answer may be on its way
             child.end(0)
             raise
-        with _lock:
-            _idle.append(child)
-        if answer["missing"] and not function.__module__.startswith("plenocli.files.artefacts"):
-            _say_once(" and no ".join(answer["missing"]))
-        return _value(answer, path, name)
+
+
+def _rests(child: _Child, answer: dict[str, Any], function: Callable[..., Any]) -> None:
+    """The child waits for the next file."""
+    with _lock:
+        _idle.append(child)
+    if answer["missing"] and not function.__module__.startswith("plenocli.files.artefacts"):
+        _say_once(" and no ".join(answer["missing"]))
+
+
+def _too_late(child: _Child, path: str | os.PathLike) -> InputError:
+    child.end(0)
+    return InputError(f"was not decoded within {TIMEOUT_S:g} s", path, _FIX)
 
 
 def _what_happened(code: int, error: BaseException) -> str:
@@ -104,13 +151,13 @@ def _what_happened(code: int, error: BaseException) -> str:
     return f"came back garbled from its decoder ({type(error).__name__})"
 
 
-def _value(answer: dict[str, Any], path: str | os.PathLike, name: str) -> Any:
+def _value(answer: dict[str, Any], path: str | os.PathLike, ask: list[Any]) -> Any:
     """What a function returned, or raised; it knew the file by another name."""
     if "lack" in answer:
         raise MemoryError(answer["lack"])
     if "error" in answer:
         kind, what, fix = answer["error"]
-        what = what.replace(name, os.fsdecode(path))
+        what = what.replace(ask[3], os.fsdecode(path))
         raise {"NumericsError": NumericsError}.get(kind, InputError)(what, path, fix)
     return answer["value"]
 
@@ -139,6 +186,10 @@ class _Child:
         """
         self._socket.settimeout(TIMEOUT_S)
         self._socket.sendall(json.dumps(what).encode() + b"\n")
+        return self.hear()
+
+    def hear(self) -> dict[str, Any]:
+        """The next part of the answer; raises as `ask`."""
         line = self._reader.readline(_HEAD_BYTES)
         if not line:
             raise EOFError
@@ -303,8 +354,14 @@ def _serve(channel: socket.socket, memory: int) -> NoReturn:
         grant_seconds(seconds)
         arrays: list[np.ndarray] = []
         try:
-            function = getattr(importlib.import_module(module), name)
-            answer = {"value": _packed(function(*arguments), arrays)}
+            found = getattr(importlib.import_module(module), name)(*arguments)
+            if isinstance(found, Generator):
+                for part in found:
+                    of_part: list[np.ndarray] = []
+                    value = _packed(part, of_part)
+                    _send(channel, {"missing": missing, "more": True, "value": value}, of_part)
+                found = None
+            answer = {"value": _packed(found, arrays)}
         except PlenoError as error:
             answer = {"error": [type(error).__name__, error.what, error.fix]}
         except MemoryError as error:
@@ -314,11 +371,15 @@ def _serve(channel: socket.socket, memory: int) -> NoReturn:
             answer = {"error": ["InputError", what, _FIX]}
         if "value" not in answer:
             arrays.clear()
-        answer |= {"missing": missing, "arrays": [[a.dtype.str, a.shape] for a in arrays]}
-        channel.sendall(json.dumps({"value": None} | answer).encode() + b"\n")
-        for array in arrays:
-            channel.sendall(array.reshape(-1).view(np.uint8).data)
+        _send(channel, {"missing": missing, "value": None} | answer, arrays)
     os._exit(0)
+
+
+def _send(channel: socket.socket, answer: dict[str, Any], arrays: list[np.ndarray]) -> None:
+    answer = answer | {"arrays": [[array.dtype.str, array.shape] for array in arrays]}
+    channel.sendall(json.dumps(answer).encode() + b"\n")
+    for array in arrays:
+        channel.sendall(array.reshape(-1).view(np.uint8).data)
 
 
 def _packed(value: Any, arrays: list[np.ndarray]) -> Any:

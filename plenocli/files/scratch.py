@@ -1,5 +1,5 @@
-"""Pictures that are made bit by bit and may not fit the memory: in a nameless file until they are
-written.
+"""Pictures that are made or read bit by bit and may not fit the memory: in a nameless file as long
+as they are worked on.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class ScratchRows(InParts):
 
     def __setitem__(self, index: Any, values: np.ndarray) -> None:
         shape, runs = self._runs(index)
-        whole = np.broadcast_to(np.asarray(values, DTYPE), shape)
+        whole = np.broadcast_to(np.asarray(values, self.dtype), shape)
         lines = np.ascontiguousarray(whole).reshape(len(runs), -1)
         for first, line in zip(runs, lines):
             with self.scratch.told():
@@ -48,7 +48,7 @@ class ScratchRows(InParts):
 
     def __getitem__(self, index: Any) -> np.ndarray:
         shape, runs = self._runs(index)
-        values = np.empty(shape, DTYPE)
+        values = np.empty(shape, self.dtype)
         for first, line in zip(runs, values.reshape(len(runs), -1)):
             self.scratch.read_into(line, first)
         return values
@@ -67,11 +67,11 @@ class ScratchRows(InParts):
         starts = np.arange(top, bottom) if right - left < width else np.arange(top, bottom)[:1]
         lines = np.add.outer(planes.ravel() * height, starts).ravel() * width + left
         shape = *planes.shape, bottom - top, right - left
-        return shape, (self.begin + lines * DTYPE.itemsize).tolist()
+        return shape, (self.begin + lines * self.dtype.itemsize).tolist()
 
 
 class Scratch:
-    """Room for pictures of float32, (..., row, column), by their shapes.
+    """Room for pictures (..., row, column) by their shapes, of float32 or another dtype.
 
     where: the result, in whose folder the file is.
 
@@ -84,18 +84,18 @@ class Scratch:
             self.file: IO[bytes] = tempfile.TemporaryFile(dir=where.parent)
         weakref.finalize(self, self.file.close)
 
-    def __call__(self, shape: tuple[int, ...]) -> ScratchRows:
+    def __call__(self, shape: tuple[int, ...], dtype: np.dtype = DTYPE) -> ScratchRows:
         begin = self._size
-        self._size += math.prod(shape) * DTYPE.itemsize
+        self._size += math.prod(shape) * dtype.itemsize
         with self.told():
             os.ftruncate(self.file.fileno(), self._size)
-        parts = partial(self._read, shape, begin)
-        return ScratchRows(shape=shape, dtype=DTYPE, parts=parts, scratch=self, begin=begin)
+        parts = partial(self._read, shape, dtype, begin)
+        return ScratchRows(shape=shape, dtype=dtype, parts=parts, scratch=self, begin=begin)
 
-    def _read(self, shape: tuple[int, ...], begin: int) -> Iterator[np.ndarray]:
+    def _read(self, shape: tuple[int, ...], dtype: np.dtype, begin: int) -> Iterator[np.ndarray]:
         for _ in range(math.prod(shape[:-2])):
             for rows in bands(shape[-2], BAND // shape[-1]):
-                values = np.empty((rows.stop - rows.start, shape[-1]), DTYPE)
+                values = np.empty((rows.stop - rows.start, shape[-1]), dtype)
                 self.read_into(values, begin)
                 begin += values.nbytes
                 yield values

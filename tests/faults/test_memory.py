@@ -289,10 +289,10 @@ def test_a_small_file_of_a_huge_picture_is_refused_before_it_is_decoded(runner, 
     content = png_of_zeros(8000)
     (tmp_path / "zeros.png").write_bytes(content)
     assert len(content) < 130_000
-    arguments = ["calibrate", "--white", "zeros.png", "-o", "a.h5", "--mem-limit", "300MiB"]
+    arguments = ["calibrate", "--white", "zeros.png", "-o", "a.h5", "--mem-limit", "120MiB"]
     outcome = runner.run(arguments, tmp_path)
     assert outcome.code == 5 and outcome.grown < 20e6 and outcome.cpu < 1, outcome
-    assert "zeros.png: needs about 367MiB to be read, more than the limit of 300MiB" in outcome.text
+    assert "zeros.png: needs about 139MiB to be read, more than the limit of 120MiB" in outcome.text
     outcome = runner.run([*arguments[:-1], "400MiB"], tmp_path)
     assert outcome.code == 5 and outcome.grown < 400e6, outcome
     assert "zeros.png: finding the lenslets needs about 1.44GiB, more than the" in outcome.text

@@ -6,21 +6,24 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from plenocli.base.budget import budget
 from plenocli.base.errors import InputError
-from plenocli.base.tiling import InParts, Plane
+from plenocli.base.tiling import EVERYTHING, InParts, Plane
 from plenocli.files.artefacts.provenance import Provenance, first_bytes, provenance_texts
 from plenocli.files.images.containers import BIO, LYTRO, Contained, read_bio, read_lytro, read_pages
 from plenocli.files.images.dng import write_dng
-from plenocli.files.images.exr import read_exr, write_exr
-from plenocli.files.images.pictures import file_type, read_stored
+from plenocli.files.images.exr import Header, read_exr, read_header, stored_channel, write_exr
+from plenocli.files.images.in_bands import SHARE, Room, put_together, require_sound, sound
+from plenocli.files.images.pictures import file_type, stored_in_parts
 from plenocli.files.images.raw import RawFile, read_raw
 from plenocli.forward.sensor.capture import Capture, CaptureMetadata, Levels, SuperpixelGrid
 from plenocli.forward.sensor.cfa import ColourProfile
@@ -32,8 +35,6 @@ if TYPE_CHECKING:
 
 CAPTURE = "plenocli:capture"  # EXR attribute: JSON of what a capture artefact has as attributes
 MOSAIC = "capture/mosaic"
-FURTHEST = 1e100
-"""Of the largest value of a capture from 1, in either direction."""
 _CFA = re.compile(r"mono|[RGB]{4}")
 
 
@@ -50,12 +51,16 @@ def read_capture(path: str | Path, *, cfa: str | None = None) -> Capture:
 
     Raises InputError, saying why.
     """
-    path = Path(path)
+    return _read(Path(path), cfa, None)
+
+
+def _read(path: Path, cfa: str | None, room: Room | None) -> Capture:
+    """As read_capture; room: for a mosaic that is large beside the memory, then a Plane."""
     kind = file_type(path)
     if kind == "exr":
-        found = _from_exr(path)
+        found = _from_exr(path, room)
     elif kind == "png" or (kind == "tiff" and path.suffix.lower() in (".tif", ".tiff")):
-        found = _from_image(path, kind, cfa or "mono")
+        found = _from_image(path, kind, cfa or "mono", room)
     elif kind == "jpeg":
         raise InputError(
             "is a JPEG: its values were demosaiced, bent and compressed",
@@ -70,10 +75,11 @@ def read_capture(path: str | Path, *, cfa: str | None = None) -> Capture:
         found = _of_values(path, read_bio(path), cfa or "mono")
     else:
         is_dng = kind == "tiff" and path.suffix.lower() == ".dng"
-        found = _from_raw(path, "dng" if is_dng else "raw", read_raw(path))
+        found = _from_raw(path, "dng" if is_dng else "raw", read_raw(path, room))
     if cfa is not None:
         _require_array(path, found, cfa)
-    _require_sound(path, found.mosaic)
+    if isinstance(found.mosaic, np.ndarray):
+        require_sound(path, [found.mosaic])
     return found
 
 
@@ -86,33 +92,22 @@ def _require_array(path: str | Path, found: Capture, cfa: str) -> None:
         )
 
 
-def _require_sound(path: Path, mosaic: np.ndarray) -> None:
-    """InputError for values that no sensor reports."""
-    if mosaic.dtype.kind == "f" and not np.isfinite(mosaic).all():
-        raise InputError(
-            f"holds {int((~np.isfinite(mosaic)).sum())} values that are NaN or infinite",
-            path,
-            "make it again",
-        )
-    loudest = max(abs(float(mosaic.max())), abs(float(mosaic.min())))
-    if loudest and not 1 / FURTHEST < loudest < FURTHEST:
-        raise InputError(
-            f"has values up to {loudest:.3g}, whose squares no number holds",
-            path,
-            "divide it by its white level; a unit changes nothing else",
-        )
-
-
 @dataclass(frozen=True)
 class StoredCapture:
-    """A capture whose mosaic stays in its file.
+    """A capture whose mosaic stays in a file.
 
     about: the capture, its mosaic without values.
-    mosaic: of its file.
+    mosaic: in its file, or decoded.
     """
 
     about: Capture
-    mosaic: Stored
+    mosaic: Stored | Plane
+
+    @property
+    def path(self) -> Path:
+        """Of the capture."""
+        assert self.about.metadata.path is not None
+        return self.about.metadata.path
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -120,28 +115,46 @@ class StoredCapture:
         rows, columns = self.mosaic.shape
         return rows, columns
 
+    @property
+    def itemsize(self) -> int:
+        """Bytes of a value."""
+        return self.about.mosaic.dtype.itemsize
+
+    def values(self, rows: slice, columns: slice = EVERYTHING) -> np.ndarray:
+        """A part of the mosaic as it is stored. Raises InputError."""
+        mosaic = self.mosaic
+        return (
+            mosaic.read(rows, columns)
+            if isinstance(mosaic, Plane)
+            else mosaic.window(rows, columns)
+        )
+
     def window(self, rows: slice, columns: slice) -> Capture:
         """The capture of a part of the sensor. Raises InputError."""
-        return self.holding(self.mosaic.window(rows, columns), rows, columns)
+        return self.holding(self.values(rows, columns), rows, columns)
 
     def holding(self, values: np.ndarray, rows: slice, columns: slice) -> Capture:
         """The capture of a part of the sensor whose values were read. Raises InputError."""
-        _require_sound(self.mosaic.path, values)
+        require_sound(self.path, [values])
         first = (part.indices(side)[0] for part, side in zip((rows, columns), self.shape))
         return replace(self.about, mosaic=values, levels=self.about.levels.from_pixel(*first))
 
 
-def capture_in_file(path: str | Path, *, cfa: str | None = None, small: bool = True) -> Capture:
-    """As read_capture, but that the mosaic of an artefact stays in its file, a Plane, where it is
-    not small.
+def capture_in_file(
+    path: str | Path, *, cfa: str | None = None, small: bool = True, room: Room | None = None
+) -> Capture:
+    """As read_capture, but that a mosaic that is not small stays in a file, a Plane.
 
-    small: whether one that is small beside the memory is held.
+    small: whether an artefact's that is small beside the memory is held.
+    room: for what is decoded of other files; None: that is held in any case.
+
+    Raises OutputError where there is no room.
     """
     from plenocli.files.artefacts.reading import opened_artefact
 
     path = Path(path)
     if not is_hdf5(path):
-        return read_capture(path, cfa=cfa)
+        return _read(path, cfa, room)
     apart = ("capture/scene",) if small else ("capture/scene", MOSAIC)
     with opened_artefact(path, "capture", apart, large=(MOSAIC,)) as (found, stored):
         mosaic: Any = found.data.get(MOSAIC)
@@ -149,7 +162,7 @@ def capture_in_file(path: str | Path, *, cfa: str | None = None, small: bool = T
             whole = _stored(path, found, stored[MOSAIC])
             mosaic = Plane(whole.shape, lambda rows, columns: whole.window(rows, columns).mosaic)
         else:
-            _require_sound(path, mosaic)
+            require_sound(path, [mosaic])
         capture = _capture_of(path, found, mosaic)
         if cfa is not None:
             _require_array(path, capture, cfa)
@@ -157,16 +170,25 @@ def capture_in_file(path: str | Path, *, cfa: str | None = None, small: bool = T
 
 
 @contextlib.contextmanager
-def stored_capture(path: str | Path, *, verify: bool = True) -> Iterator[StoredCapture | None]:
-    """The capture of an artefact, None for another file; verify: as of opened_artefact.
+def stored_capture(
+    path: str | Path, *, room: Room | None = None, verify: bool = True
+) -> Iterator[StoredCapture]:
+    """The capture at `path`, whose mosaic stays in a file: always that of an artefact, of another
+    file one that is large beside the memory.
 
-    Raises InputError.
+    room: as of capture_in_file.
+    verify: as of opened_artefact.
+
+    Raises as capture_in_file.
     """
     from plenocli.files.artefacts.reading import opened_artefact
 
     path = Path(path)
     if not is_hdf5(path):
-        yield None
+        found = _read(path, None, room)
+        mosaic = Plane.of(found.mosaic)
+        few = mosaic.read(slice(0, 1), slice(0, 1))
+        yield StoredCapture(replace(found, mosaic=few[:0, :0]), mosaic)
         return
     apart = (MOSAIC, "capture/scene")
     with opened_artefact(path, "capture", apart, verify=verify) as (artefact, stored):
@@ -210,11 +232,17 @@ def _capture_of(path: Path, artefact: Artefact, mosaic: np.ndarray) -> Capture:
     return replace(found, metadata=metadata, grid=grid)
 
 
-def _from_exr(path: Path) -> Capture:
-    channels, attrs = read_exr(path)
-    if set(channels) != {"Y"} and len(channels) != 1:
+def _from_exr(path: Path, room: Room | None) -> Capture:
+    header, channels = (None if room is None else read_header(path)), {}
+    size = 0 if header is None else 4 * math.prod(header.shape)
+    if header is None or not header.by_lines or size <= budget().memory // SHARE:
+        header, (channels, attrs) = None, read_exr(path)
+        names = list(channels)
+    else:
+        names, attrs = header.names, header.attrs
+    if len(names) != 1:
         raise InputError(
-            f"has {len(channels)} channels ({', '.join(list(channels)[:6])}), a mosaic has one",
+            f"has {len(names)} channels ({', '.join(names[:6])}), a mosaic has one",
             path,
             "give a capture",
         )
@@ -222,7 +250,20 @@ def _from_exr(path: Path) -> Capture:
         said = dict(json.loads(attrs.get(CAPTURE, "{}")))
     except (TypeError, ValueError) as error:
         raise InputError(f"has a broken attribute {CAPTURE}", path, "make it again") from error
-    return _described(path, next(iter(channels.values())), said, "exr")
+    stays: Any = None if header is None else _sound_lines(path, header)
+    return _described(path, channels[names[0]] if stays is None else stays, said, "exr")
+
+
+def _sound_lines(path: Path, header: Header) -> Plane:
+    """The one channel of an EXR, whose windows raise InputError as require_sound."""
+    lines = stored_channel(path, header, header.names[0])
+
+    def read(rows: slice, columns: slice) -> np.ndarray:
+        values = lines.read(rows, columns)
+        require_sound(path, [values])
+        return values
+
+    return Plane(lines.shape, read)
 
 
 def _described(path: Path, values: np.ndarray, said: dict[str, Any], source: str) -> Capture:
@@ -339,32 +380,43 @@ def _of_values(path: Path, values: np.ndarray, cfa: str, white: float | None = N
     return Capture(mosaic=values, cfa=cfa, levels=Levels(white=white), metadata=metadata)
 
 
-def _from_image(path: Path, kind: str, cfa: str) -> Capture:
+def _from_image(path: Path, kind: str, cfa: str, room: Room | None) -> Capture:
     pages = read_pages(path) if kind == "tiff" else None
     if pages is not None:
         return _of_values(path, pages.values, cfa, pages.white)
-    values, names, bits = read_stored(path, kind)
-    keep = [i for i, name in enumerate(names) if name.upper() not in ("A", "ALPHA")]
-    values = values[..., keep]
-    details: dict[str, Any] = {"bits": bits, "verified": False}
-    if values.dtype.kind not in "uf":
-        raise InputError(f"holds {values.dtype} values", path, "give unsigned integers or float")
-    if values.shape[-1] > 1:
-        if (values == values[..., :1]).all():
-            details["note"] = f"{values.shape[-1]} identical channels, one taken"
-        else:
-            raise InputError(
-                f"is a picture with {values.shape[-1]} different channels, not a mosaic "
-                "with one value a pixel",
-                path,
-                "give the sensor's mosaic before demosaicing",
-            )
+    head, parts = stored_in_parts(path, kind, held=room is None)
+    details: dict[str, Any] = {"bits": head.bits, "verified": False}
+    keep = [i for i, name in enumerate(head.names) if name.upper() not in ("A", "ALPHA")]
+    if len(keep) > 1:
+        details["note"] = f"{len(keep)} identical channels, one taken"
+    values: Any = put_together(sound(path, _one_channel(path, parts, keep)), head.shape[:2], room)
+    is_whole = Plane.of(values).read(slice(0, 1), slice(0, 1)).dtype.kind == "u"
     return Capture(
-        mosaic=np.ascontiguousarray(values[..., 0]),
+        mosaic=values,
         cfa=cfa,
-        levels=Levels(white=float(2**bits - 1) if values.dtype.kind == "u" else np.inf),
+        levels=Levels(white=float(2**head.bits - 1) if is_whole else np.inf),
         metadata=CaptureMetadata(source="image", path=path, details=details),
     )
+
+
+def _one_channel(path: Path, parts: Iterable[np.ndarray], keep: list[int]) -> Iterator[np.ndarray]:
+    """The first of the channels to keep, of bands (row, column, channel); InputError behind the
+    last where they are not all the same, or no numbers of a sensor.
+    """
+    same = True
+    for part in parts:
+        if part.dtype.kind not in "uf":
+            raise InputError(f"holds {part.dtype} values", path, "give unsigned integers or float")
+        values = part[..., keep]
+        same = same and (len(keep) == 1 or bool((values == values[..., :1]).all()))
+        yield np.ascontiguousarray(values[..., 0])
+    if not same:
+        raise InputError(
+            f"is a picture with {len(keep)} different channels, not a mosaic "
+            "with one value a pixel",
+            path,
+            "give the sensor's mosaic before demosaicing",
+        )
 
 
 # --- writing --------------------------------------------------------------------------------------

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from plenocli.base.budget import budget
 from plenocli.base.errors import InputError
+from plenocli.base.tiling import bands
 from plenocli.files.artefacts.provenance import first_bytes
 from plenocli.files.images.exr import oiio_error, oiio_name, require_at_most
-from plenocli.files.outside import outside
+from plenocli.files.images.in_bands import DECODED, put_together, whole_bands
+from plenocli.files.outside import outside_in_parts
 from plenocli.files.seal import require_seal
 
 _MAGIC = (
@@ -111,6 +115,20 @@ def file_type(path: str | os.PathLike[str]) -> str | None:
     return next((kind for magic, kind in _MAGIC if head.startswith(magic)), None)
 
 
+@dataclass(frozen=True, kw_only=True)
+class StoredHead:
+    """What a PNG, JPEG or TIFF says before its values.
+
+    shape: (rows, columns, channels).
+    names: of the channels.
+    bits: of a value.
+    """
+
+    shape: tuple[int, int, int]
+    names: list[str]
+    bits: int
+
+
 def read_stored(
     path: str | os.PathLike[str], kind: str, *, most: int | None = None
 ) -> tuple[np.ndarray, list[str], int]:
@@ -121,16 +139,31 @@ def read_stored(
 
     Returns (values (row, column, channel), channel names, bits); values of odd bit depths (10, 12,
     14) come back unscaled in uint16.
-    Raises InputError, also for a TIFF of ours that was altered.
+    Raises InputError, also for a TIFF of ours that was altered; NumericsError where the memory of
+    this process does not hold them.
+    """
+    head, parts = stored_in_parts(path, kind, most=most)
+    return np.asarray(put_together(parts, head.shape)), head.names, head.bits
+
+
+def stored_in_parts(
+    path: str | os.PathLike[str], kind: str, *, most: int | None = None, held: bool = True
+) -> tuple[StoredHead, Iterator[np.ndarray]]:
+    """The head of a PNG, JPEG or TIFF, and its values in bands of rows (row, column, channel), one
+    after the other, as they are decoded; as read_stored.
+
+    held: whether all bands will be in memory together.
     """
     if kind == "tiff":
         require_seal(path)
-    values, names, bits = outside(_stored, path, kind, most)
-    return values, names, bits
+    parts = outside_in_parts(_decoded, path, kind, most, held)
+    said = next(parts)
+    head = StoredHead(shape=tuple(said["shape"]), names=said["names"], bits=said["bits"])
+    return head, whole_bands(path, parts, head.shape)
 
 
-def _stored(path: str, kind: str, most: int | None) -> tuple[np.ndarray, list[str], int]:
-    """As read_stored; runs outside."""
+def _decoded(path: str, kind: str, most: int | None, held: bool) -> Iterator[Any]:
+    """The head of stored_in_parts, and bands of rows; runs outside."""
     import OpenImageIO as oiio
 
     settings = oiio.ImageSpec()
@@ -149,24 +182,40 @@ def _stored(path: str, kind: str, most: int | None) -> tuple[np.ndarray, list[st
                 path,
                 "give a flat picture",
             )
-        count = spec.width * spec.height * spec.nchannels
-        needed = count * (spec.format.size() + 4)
-        require_at_most(path, needed, most)
-        budget().require_declared(path, count * spec.format.size(), needed)
-        values = source.read_image(spec.format)
-        trouble = oiio_error(source)
-        if values is None or trouble:
-            raise InputError(f"is damaged: {trouble}", path, "make or copy it again")
-        values = np.asarray(values).reshape(spec.height, spec.width, spec.nchannels)
-        container = 8 * values.itemsize
+        size = spec.format.size()
+        declared = spec.width * spec.height * spec.nchannels * size
+        line = spec.width * spec.nchannels * size
+        require_at_most(path, declared, most)
+        rows = min(spec.tile_height or max(1, DECODED // line), spec.height)
+        budget().require_declared(path, declared, (declared if held else 0) + 4 * rows * line)
+        container = 8 * size
         bits = spec.get_int_attribute("oiio:BitsPerSample", container)
-        if values.dtype.kind == "u" and 8 < bits < container:
+        whole = spec.format.basetype in (oiio.UINT8, oiio.UINT16, oiio.UINT32)
+        shape = [spec.height, spec.width, spec.nchannels]
+        told = bits if whole else container
+        yield {"shape": shape, "names": list(spec.channelnames), "bits": told}
+        for part in bands(spec.height, rows):
+            values = _rows(path, source, spec, part)
             # OpenImageIO fills the upper bits; this undoes it exactly
-            values = values >> (container - bits)
-        return values, list(spec.channelnames), bits if values.dtype.kind == "u" else container
+            yield values >> (container - bits) if whole and 8 < bits < container else values
     finally:
         source.close()
         oiio_error(source)
+
+
+def _rows(path: str, source: Any, spec: Any, rows: slice) -> np.ndarray:
+    """Rows of an open picture, of a tiled one those of its tiles."""
+    first, last, left = spec.y + rows.start, spec.y + rows.stop, spec.x
+    if spec.tile_width:
+        right = left + spec.width
+        ends = left, right, first, last, spec.z, spec.z + 1
+        values = source.read_tiles(*ends, 0, spec.nchannels, spec.format)
+    else:
+        values = source.read_scanlines(first, last, spec.z, 0, spec.nchannels, spec.format)
+    trouble = oiio_error(source)
+    if values is None or trouble:
+        raise InputError(f"is damaged: {trouble}", path, "make or copy it again")
+    return np.asarray(values).reshape(rows.stop - rows.start, spec.width, spec.nchannels)
 
 
 def _from_exr(path: str | os.PathLike[str]) -> Picture:

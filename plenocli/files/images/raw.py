@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import os
 import re
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,14 +18,16 @@ import numpy as np
 
 from plenocli.base.budget import budget
 from plenocli.base.errors import InputError, PlenoError
+from plenocli.base.tiling import Plane, bands
 from plenocli.files.artefacts.provenance import require_file
 from plenocli.files.images.dng import read_notes
-from plenocli.files.outside import outside
+from plenocli.files.images.in_bands import DECODED, Room, put_together, whole_bands
+from plenocli.files.outside import outside, outside_in_parts
 from plenocli.files.seal import require_seal
 from plenocli.forward.sensor.cfa import ColourProfile
 
-_COPIES = 4
-"""Of a mosaic that exist at the same time while it is read, in this process and outside."""
+DECODER_COPIES = 2
+"""Of a mosaic that LibRaw, its colours and a band of rows take (measured)."""
 _FIX = "give an intact camera RAW or DNG with a colour filter mosaic"
 _CLOCK = re.compile(r"([12]\d{3}):(\d\d):(\d\d) (\d\d:\d\d:\d\d)")
 _REASONS = {
@@ -42,7 +45,7 @@ _REASONS = {
 class RawFile:
     """What a camera's RAW or a DNG holds.
 
-    values: (row, column) uint16 without masked borders, DN.
+    values: (row, column) uint16 without masked borders, DN; a Plane where it has room in a file.
     cfa: "mono" or four letters, row by row.
     black: (2, 2) by position, DN.
     white: DN.
@@ -52,7 +55,7 @@ class RawFile:
     details: what else the file says, by its names.
     """
 
-    values: np.ndarray
+    values: np.ndarray | Plane
     cfa: str
     black: np.ndarray
     white: float
@@ -62,19 +65,23 @@ class RawFile:
     details: dict[str, Any]
 
 
-def read_raw(path: str | Path) -> RawFile:
+def read_raw(path: str | Path, room: Room | None = None) -> RawFile:
     """Read a RAW file or DNG.
 
+    room: for its mosaic, where that is large beside the memory; LibRaw itself holds all of it.
+
     Raises InputError, saying why, for a file that LibRaw cannot read, that holds no mosaic, or
-    whose mosaic is implausible.
+    whose mosaic is implausible; NumericsError where the memory of this process does not hold it;
+    OutputError where there is no room.
     """
     path = Path(path)
     size = require_file(path)
     budget().require_reading(path, size)
     ours = require_seal(path)
-    found = outside(_decoded, path)
-    values, cfa = found["values"], _letters(path, found)
-    if values.ndim != 2 or values.size == 0:
+    parts = outside_in_parts(_decoded, path, room is None)
+    found = next(parts)
+    cfa, shape = _letters(path, found), tuple(found["shape"])
+    if len(shape) != 2 or 0 in shape:
         raise InputError("came back incomplete from LibRaw", path, _FIX)
     black = (
         np.array(found["black"])[np.clip(np.array(found.get("indices", [[0, 0], [0, 0]])), 0, 3)]
@@ -87,8 +94,10 @@ def read_raw(path: str | Path) -> RawFile:
             np.broadcast_to(np.asarray(notes["black"]), (2, 2)).astype(float),
             notes["white"],
         )
-    else:
-        _check_plausible(path, values, black, found["white"])
+    counts = np.zeros((2, 2, 1 << 16), np.int64)
+    values = put_together(_counted(whole_bands(path, parts, shape), counts), shape, room)
+    if not notes:
+        _check_plausible(path, counts, black, found["white"])
     details = {
         key: found[key]
         for key in ("full_shape", "camera_white", "iso", "f_number", "focal_length_m")
@@ -110,6 +119,19 @@ def read_raw(path: str | Path) -> RawFile:
     )
 
 
+def _counted(parts: Iterable[np.ndarray], counts: np.ndarray) -> Iterator[np.ndarray]:
+    """The same bands of rows, of uint16; `counts` (2, 2, value) then has how many pixels of each
+    position report each value.
+    """
+    top = 0
+    for part in parts:
+        for i, j in np.ndindex(2, 2):
+            here = part[(i - top) % 2 :: 2, j::2]
+            counts[i, j] += np.bincount(here.ravel(), minlength=counts.shape[2])
+        top += len(part)
+        yield part
+
+
 def _profile(found: dict[str, Any]) -> ColourProfile | None:
     """The camera's colours by the matrix that the file, or LibRaw of its maker, tells; white is
     that of the shot.
@@ -125,8 +147,11 @@ def _profile(found: dict[str, Any]) -> ColourProfile | None:
     return None
 
 
-def _decoded(path: str) -> dict[str, Any]:
-    """What LibRaw and the EXIF tags say of a file; runs outside."""
+def _decoded(path: str, held: bool) -> Iterator[Any]:
+    """What LibRaw and the EXIF tags say of a file, then its mosaic in bands of rows; runs outside.
+
+    held: whether all bands will be in memory together.
+    """
     import rawpy
 
     name = path
@@ -136,17 +161,22 @@ def _decoded(path: str) -> dict[str, Any]:
         name = f"/proc/self/fd/{os.open(path, os.O_RDONLY)}"
     try:
         with rawpy.imread(name) as raw:
-            return {**_mosaic(path, raw), "exif": _exif(path)}
+            declared = 2 * raw.sizes.raw_width * raw.sizes.raw_height
+            needed = (DECODER_COPIES + held) * declared
+            why = ": LibRaw holds the whole mosaic"
+            budget().require_declared(path, declared, needed, why=why)
+            yield {**_said(path, raw), "exif": _exif(path)}
+            visible = raw.raw_image_visible
+            for rows in bands(visible.shape[0], DECODED // (2 * visible.shape[1])):
+                yield visible[rows].astype("<u2")  # LibRaw frees the mosaic when it is closed
     except rawpy.LibRawError as error:
         raise InputError(_reason(error, path), path, _FIX) from None
 
 
-def _mosaic(path: str, raw: Any) -> dict[str, Any]:
-    """Values, levels and colours of a file that LibRaw has open."""
+def _said(path: str, raw: Any) -> dict[str, Any]:
+    """Shape, levels and colours of a file that LibRaw has open."""
     import rawpy
 
-    declared = 2 * raw.sizes.raw_width * raw.sizes.raw_height
-    budget().require_declared(path, declared, _COPIES * declared)
     if raw.raw_type != rawpy.RawType.Flat:
         raise InputError(
             f"holds {raw.raw_image.shape[-1]} values a pixel, not a colour filter mosaic: "
@@ -156,8 +186,7 @@ def _mosaic(path: str, raw: Any) -> dict[str, Any]:
         )
     colours, camera_white = raw.raw_colors_visible, raw.camera_white_level_per_channel
     found = {
-        # a copy: LibRaw frees the mosaic when it is closed
-        "values": raw.raw_image_visible.astype("<u2"),
+        "shape": list(raw.raw_image_visible.shape),
         "full_shape": list(raw.raw_image.shape),
         "description": raw.color_desc.decode("latin-1"),
         "colour_count": int(raw.num_colors),
@@ -275,11 +304,15 @@ def _exposure(found: dict[str, Any]) -> float | None:
     return exact if exact and (not rounded or abs(exact / rounded - 1) < 1e-3) else rounded or None
 
 
-def _check_plausible(path: Path, values: np.ndarray, black: np.ndarray, white: float) -> None:
+def _check_plausible(path: Path, counts: np.ndarray, black: np.ndarray, white: float) -> None:
     """Refuse a mosaic that opens without error and yet cannot be a photograph: LibRaw fills what
     it could not read with zeros.
+
+    counts: (2, 2, value) pixels of each position with each value.
     """
-    zeros = float(np.mean(values == 0))
+    value, every = np.arange(counts.shape[2]), counts.sum(axis=(0, 1))
+    size = int(every.sum())
+    zeros = float(every[0] / size)
     if zeros >= 0.99:
         raise InputError(
             f"is {zeros:.1%} zeros although LibRaw reports no error: the image data "
@@ -293,7 +326,7 @@ def _check_plausible(path: Path, values: np.ndarray, black: np.ndarray, white: f
             path,
             _FIX,
         )
-    over = float(np.mean(values > white))
+    over = float(every[value > white].sum() / size)
     if over > 0.01:
         raise InputError(
             f"contradicts its metadata: {over:.1%} of the pixels are above its white "
@@ -301,17 +334,15 @@ def _check_plausible(path: Path, values: np.ndarray, black: np.ndarray, white: f
             path,
             _FIX,
         )
-    below = [
-        float(np.mean(values[i::2, j::2] < black[i, j] - 0.02 * (white - black[i, j])))
-        for i in (0, 1)
-        for j in (0, 1)
-    ]
-    if max(below) > 0.5:
+    least = black - 0.02 * (white - black)
+    below = np.where(value < least[..., None], counts, 0).sum(axis=2)
+    share = float((below / np.maximum(counts.sum(axis=2), 1)).max())
+    if share > 0.5:
         raise InputError(
-            f"contradicts its metadata: {max(below):.0%} of the pixels at one position lie far "
+            f"contradicts its metadata: {share:.0%} of the pixels at one position lie far "
             f"below its black level of {black.max():g} DN",
             path,
             _FIX,
         )
-    if values.size > 1 and values.min() == values.max():
-        raise InputError(f"is one single value, {values.min()}, everywhere", path, _FIX)
+    if size > 1 and every.max() == size:
+        raise InputError(f"is one single value, {every.argmax()}, everywhere", path, _FIX)

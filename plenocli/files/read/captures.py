@@ -19,6 +19,7 @@ from plenocli.base.progress import collected_notes
 from plenocli.files.artefacts.provenance import require_file
 from plenocli.files.images.mosaic import StoredCapture, read_capture, stored_capture
 from plenocli.files.read.calibrations import read_calibration
+from plenocli.files.scratch import Scratch
 from plenocli.inverse.calibration.calibration import Calibration
 from plenocli.inverse.picture.lenslet_model import LensletMatrix, Superpixels
 from plenocli.inverse.picture.superpixels import superpixels
@@ -135,8 +136,8 @@ class _Held:
 
 
 class _Windows:
-    """Windows of a stored capture. Chunks of its file are as wide as the sensor, so that tiles side
-    by side would unpack the same ones: the last rows are kept where they are few.
+    """Windows of a stored capture. Chunks of its file, if it has any, are as wide as the sensor, so
+    that tiles side by side would unpack the same ones: the last rows are kept where they are few.
     """
 
     def __init__(self, capture: StoredCapture) -> None:
@@ -145,13 +146,12 @@ class _Windows:
 
     def read(self, rows: slice, columns: slice) -> Capture:
         """That of some pixels. Raises InputError."""
-        mosaic = self.capture.mosaic
-        size = (rows.stop - rows.start) * mosaic.shape[1] * mosaic.dtype.itemsize
+        size = (rows.stop - rows.start) * self.capture.shape[1] * self.capture.itemsize
         if size > KEPT_SHARE * budget().memory:
             return self.capture.window(rows, columns)
         if self._rows is None or self._rows[0] != rows:
             self._rows = None  # not two at a time
-            values = mosaic.window(rows)
+            values = self.capture.values(rows).view()
             values.flags.writeable = False
             self._rows = rows, values
         return self.capture.holding(self._rows[1][:, columns], rows, columns)
@@ -190,32 +190,44 @@ def superpixel_source(
     calibration: str | Path | None = None,
     *,
     each_pixel: bool = False,
+    beside: Path | None = None,
     verify: bool = True,
 ) -> Iterator[Source]:
     """As read_superpixels, but that those of a simulated capture stay in its file until they are
     asked for.
 
+    beside: the result, in whose folder a file that cannot be read in parts is decoded to one that
+        can, where it is large; None: it is held.
     verify: as of plenocli.files.artefacts.reading.opened_artefact; a file that was verified before
         is opened once.
     """
     if calibration is None:
-        windows = _windows(Path(path)) if verify else _known(Path(path), _stamp(path))
-        if windows is not None and _divides(system.pixel_shape, windows.capture):
+        path = Path(path)
+        windows = _windows(path, beside) if verify else _known(path, beside, _stamp(path))
+        if _divides(system.pixel_shape, windows.capture):
             yield _Stored(windows, system)
             return
     yield _Held(read_superpixels(path, system, calibration, each_pixel=each_pixel))
 
 
-def _windows(path: Path, *, verify: bool = True) -> _Windows | None:
-    """Those of a capture, None where its mosaic does not stay in the file."""
-    with stored_capture(path, verify=verify) as stored:
-        return None if stored is None else _Windows(stored)
+def room_beside(target: Path | None) -> Scratch | None:
+    """Room in the folder of a result, None where there is no such folder, as for another machine.
+
+    Raises OutputError where nothing can be put there.
+    """
+    return None if target is None or not target.parent.is_dir() else Scratch(target)
+
+
+def _windows(path: Path, beside: Path | None, *, verify: bool = True) -> _Windows:
+    """Those of a capture."""
+    with stored_capture(path, room=room_beside(beside), verify=verify) as stored:
+        return _Windows(stored)
 
 
 @lru_cache(maxsize=1)
-def _known(path: Path, stamp: tuple[int, int]) -> _Windows | None:
+def _known(path: Path, beside: Path | None, stamp: tuple[int, int]) -> _Windows:
     """The same of a file that this run has verified."""
-    return _windows(path, verify=False)
+    return _windows(path, beside, verify=False)
 
 
 def _stamp(path: str | Path) -> tuple[int, int]:

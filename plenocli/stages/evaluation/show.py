@@ -34,12 +34,14 @@ class ShowSummary(Record):
 class _Choice:
     """What of the files is drawn.
 
+    output: the picture.
     centres: (lenslet_row, lenslet_column, 2) px, over captures.
     points: (row, column) of object points, whose columns of A are shown.
     lenslets: (row, column), whose spectra are shown.
     matrix: whose sensor sees a dictionary.
     """
 
+    output: Path
     centres: np.ndarray | None = None
     points: Sequence[Place] | None = None
     lenslets: Sequence[Place] | None = None
@@ -90,6 +92,7 @@ def run_show(
     else:
         matrix = next((file for file in found if file.kind == "pif"), None)
         choice = _Choice(
+            output=output,
             centres=centres,
             points=points or None,
             lenslets=lenslets or None,
@@ -131,16 +134,15 @@ def _require_inside(
 
 
 def _capture(file: OpenedFile, choice: _Choice) -> Figures:
-    from plenocli.files.images.mosaic import read_capture, stored_capture
+    from plenocli.files.images.mosaic import stored_capture
+    from plenocli.files.scratch import Scratch
     from plenocli.report.figures import capture_figures
 
-    name, centres = file.path.name, choice.centres
+    centres = choice.centres
     if centres is None and file.artefact is not None:
         centres = file.artefact.data.get("capture/lenslet_centre")
-    with stored_capture(file.path, verify=False) as stored:
-        if stored is not None:
-            return capture_figures(stored.about, name, centres, stored)
-    return capture_figures(read_capture(file.path), name, centres)
+    with stored_capture(file.path, room=Scratch(choice.output), verify=False) as stored:
+        return capture_figures(stored.about, file.path.name, centres, stored)
 
 
 def _calibration(file: OpenedFile, choice: _Choice) -> Figures:

@@ -4,7 +4,7 @@ standard deviations.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache, partial
 from pathlib import Path
@@ -19,7 +19,7 @@ from plenocli.base.text import Record
 from plenocli.execution.batch import outcomes, plan_batch, summarise
 from plenocli.execution.pool import absolute, open_pool
 from plenocli.files.images.mosaic import capture_in_file
-from plenocli.files.read.captures import describe_capture, named_captures
+from plenocli.files.read.captures import describe_capture, named_captures, room_beside
 from plenocli.forward.scene.white_reference import REFERENCE_REFLECTANCE
 from plenocli.inverse.spectra.bands import stokes
 from plenocli.inverse.spectra.demultiplexer import Demultiplexer, method_of_white, tell_misfit
@@ -151,6 +151,7 @@ def run_demux(
                 command,
                 threads=min(workers, len(batch.todo)),
                 several=len(batch.todo) > 1,
+                targets=dict(batch.todo),
             )
             if batch.todo
             else None
@@ -294,6 +295,8 @@ class CaptureDemultiplexer:
     command: for their provenance.
     threads: for factoring the response.
     several: whether many captures follow.
+    targets: their results, beside which a capture that cannot be read in parts is decoded where it
+        is large; that of others is held.
     """
 
     def __init__(
@@ -304,6 +307,7 @@ class CaptureDemultiplexer:
         command: str,
         threads: int = 1,
         several: bool = True,
+        targets: Mapping[Path, Path] | None = None,
     ) -> None:
         from plenocli.files.artefacts.provenance import describe_inputs
         from plenocli.files.read.calibrations import read_described
@@ -312,6 +316,7 @@ class CaptureDemultiplexer:
         from plenocli.inverse.calibration.calibration import there
 
         self.settings, self.overwrite, self.command = settings, overwrite, command
+        self.targets = targets or {}
         self.inputs = describe_inputs(_roles(calibration, settings))
         found, described = read_described(
             calibration, needs=("response", "windows", "white", "dark"), in_file=True
@@ -343,7 +348,8 @@ class CaptureDemultiplexer:
 
         method: of a reference, whose misfit is told with each capture's.
         """
-        capture = capture_in_file(path, cfa=self.solver.responses.cfa)
+        room = room_beside(self.targets.get(Path(path)))
+        capture = capture_in_file(path, cfa=self.solver.responses.cfa, room=room)
         found = self.solver.estimate(capture, path, method)
         if method is None:
             told = {str(path): found}

@@ -152,7 +152,7 @@ def _refocused(
     from plenocli.inverse.lightfield.light_field import in_memory, refocused
 
     target = targets[capture]
-    source = _source(capture, settings.calibration)
+    source = _source(capture, settings.calibration, target)
     return (
         refocused(
             source,
@@ -204,12 +204,13 @@ def _write(
     )
 
 
-def _source(capture: Path, calibration: Path | None) -> SampleBands:
-    """Samples of a capture, or of spectra that demux made of one."""
+def _source(capture: Path, calibration: Path | None, target: Path) -> SampleBands:
+    """Samples of a capture, or of spectra that demux made of one, on the way to `target`."""
     from plenocli.files.images.mosaic import capture_in_file
     from plenocli.files.opened_file import open_file
     from plenocli.files.read.calibrations import read_calibration, read_images
     from plenocli.files.results.results import read_result
+    from plenocli.files.scratch import Scratch
     from plenocli.inverse.lightfield.gather import bands_of, samples_of_spectra
     from plenocli.inverse.lightfield.samples import SampleBands
 
@@ -228,7 +229,8 @@ def _source(capture: Path, calibration: Path | None) -> SampleBands:
             *samples_of_spectra(spectra.values, spectra.wavelengths, known, where=calibration)
         )
     found = None if calibration is None else read_images(calibration)
-    return bands_of(capture_in_file(capture, small=False), found, where=calibration)
+    shot = capture_in_file(capture, small=False, room=Scratch(target))
+    return bands_of(shot, found, where=calibration)
 
 
 def _told(depth: DepthMap | None, slopes: np.ndarray) -> tuple[float | None, float | None]:

@@ -192,7 +192,7 @@ def _looked_at(
         known = read_images(calibration, small=True, superpixels=True)
         cfa = known.sensor.cfa
     return measured(
-        capture_in_file(capture, cfa=cfa),
+        capture_in_file(capture, cfa=cfa, room=room),
         stack,
         known,
         where=calibration,

@@ -69,7 +69,9 @@ def picture_in_tiles(
         finer, estimators = better is not None, better or estimators
         limits = limits_of(estimators, data)
     off = error_that_counts(limits)
-    task = _TileTask(recipe=recipe, capture=capture, finer=finer, model_error=off, whole=whole)
+    task = _TileTask(
+        recipe=recipe, capture=capture, target=target, finer=finer, model_error=off, whole=whole
+    )
     data, cause = replace(data, whole=whole), partial(likely_cause, estimators)
     sample, seen = estimate(estimators, method, data, model_error=off, explain=cause)
     all_weigh = METHODS[sample.method].weighs_all  # of the one that auto took
@@ -101,6 +103,7 @@ def picture_in_tiles(
 class _TileTask:
     """The task of a tile, in any process; what they share is made once a process.
 
+    target: beside which a capture that cannot be read in parts is decoded.
     finer: whether by a finer matrix of the camera.
     model_error: of the matrix, see estimate.
     whole: what is known of the capture.
@@ -108,6 +111,7 @@ class _TileTask:
 
     recipe: Recipe
     capture: Path
+    target: Path
     finer: bool
     model_error: float
     whole: Whole
@@ -146,7 +150,7 @@ class _TileTask:
         method, system = METHODS[recipe.settings.method], estimators.system
         with collected_notes():
             with superpixel_source(
-                self.capture, system, recipe.calibration, verify=False
+                self.capture, system, recipe.calibration, beside=self.target, verify=False
             ) as source:
                 data = replace(source.cut(*tile.around, tile.within), whole=whole)
             return estimate(estimators, method, data, model_error=self.model_error)[0]

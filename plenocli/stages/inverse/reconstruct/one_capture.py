@@ -75,14 +75,14 @@ def reconstruct_capture(
         return _solved(found, settings, rgb=rgb)
     estimators, method = estimators_of(recipe), METHODS[settings.method]
     system = estimators.system
+    where = None if far else targets.get(capture)
     with superpixel_source(
-        capture, system, recipe.calibration, each_pixel=method.each_pixel
+        capture, system, recipe.calibration, each_pixel=method.each_pixel, beside=where
     ) as source:
         tiles = tiles_of(estimators, method, source.count)
         apart = len(tiles) > 1 and not settings.fit and settings.truth is None
-        if apart and field_of(recipe) is None and capture in targets and not far:
-            target = targets[capture]
-            return picture_in_tiles(recipe, capture, source, tiles, pool or InProcess(), target)
+        if apart and field_of(recipe) is None and where is not None:
+            return picture_in_tiles(recipe, capture, source, tiles, pool or InProcess(), where)
         data = source.cut(*EVERY)
     look = method.sees is not Sees.LENSLET_AS_IS
     require_reconstruction(

@@ -1,0 +1,99 @@
+"""Pictures that decoders send in bands of rows: put together in memory, or, where they are large
+beside it, in a file.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from plenocli.base.budget import budget
+from plenocli.base.errors import InputError
+from plenocli.base.tiling import Plane
+
+DECODED = 1 << 22
+"""Bytes of a band of rows that a decoder sends, about."""
+SHARE = 16
+"""Of the memory, one part: pictures up to that are held."""
+FURTHEST = 1e100
+"""Of the largest value of a capture from 1, in either direction."""
+_FIX = "make or copy it again"
+Room = Callable[..., Any]
+"""What gives room for values of a shape and dtype, put and looked at by rows and columns, beside
+the memory (plenocli.files.scratch.Scratch).
+"""
+
+
+def whole_bands(
+    path: str | Path, parts: Iterable[Any], shape: tuple[int, ...]
+) -> Iterator[np.ndarray]:
+    """Bands of rows that a decoder sends; InputError where they are not those of a picture of a
+    shape (row, column, ...).
+    """
+    rows = 0
+    for part in parts:
+        fits = isinstance(part, np.ndarray) and part.shape[1:] == shape[1:] and len(part) > 0
+        rows += len(part) if fits else 0
+        if not fits or rows > shape[0]:
+            break
+        yield part
+    else:
+        if rows == shape[0]:
+            return
+    raise InputError("came back incomplete from its decoder", path, _FIX)
+
+
+def put_together(
+    parts: Iterable[np.ndarray], shape: tuple[int, ...], room: Room | None = None
+) -> np.ndarray | Plane:
+    """The picture of all bands of rows, whose number is that of `shape`.
+
+    shape: (row, column), or with channels behind them where it is held.
+    room: where it is put if it is more than a SHARE of the memory; None: it is held in any case.
+
+    Raises what parts raise; NumericsError or OutputError where there is no room.
+    """
+    kept: Any = None
+    is_held, top = True, 0
+    for part in parts:
+        if kept is None:
+            is_held = room is None or math.prod(shape) * part.itemsize <= budget().memory // SHARE
+            kept = np.empty(shape, part.dtype) if is_held else _there(room)(shape, part.dtype)
+        kept[top : top + len(part)] = part
+        top += len(part)
+    return kept if is_held else Plane((shape[0], shape[1]), lambda *window: kept[window])
+
+
+def _there(room: Room | None) -> Room:
+    assert room is not None
+    return room
+
+
+def sound(path: Path, parts: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
+    """The same bands; InputError behind the last for values that no sensor reports."""
+    unknown, most = 0, 0.0
+    for part in parts:
+        known = np.isfinite(part) if part.dtype.kind == "f" else None
+        lost = 0 if known is None else int(known.size - known.sum())
+        unknown += lost
+        if not lost and part.size:
+            most = max(most, abs(float(part.max())), abs(float(part.min())))
+        yield part
+    if unknown:
+        raise InputError(f"holds {unknown} values that are NaN or infinite", path, "make it again")
+    if most and not 1 / FURTHEST < most < FURTHEST:
+        raise InputError(
+            f"has values up to {most:.3g}, whose squares no number holds",
+            path,
+            "divide it by its white level; a unit changes nothing else",
+        )
+
+
+def require_sound(path: Path, parts: Iterable[np.ndarray]) -> None:
+    """InputError for values that no sensor reports, in any of some bands."""
+    for _ in sound(path, parts):
+        pass

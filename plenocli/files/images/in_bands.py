@@ -16,7 +16,7 @@ from plenocli.base.errors import InputError
 from plenocli.base.tiling import Plane
 
 DECODED = 1 << 22
-"""Bytes of a band of rows that a decoder sends, about."""
+"""Bytes of a band of rows that a decoder sends, at most, about."""
 SHARE = 16
 """Of the memory, one part: pictures up to that are held."""
 FURTHEST = 1e100
@@ -26,6 +26,11 @@ Room = Callable[..., Any]
 """What gives room for values of a shape and dtype, put and looked at by rows and columns, beside
 the memory (plenocli.files.scratch.Scratch).
 """
+
+
+def rows_of(line: int) -> int:
+    """Rows of a band that a decoder sends; line: bytes of one."""
+    return max(1, min(DECODED, budget().memory // (4 * SHARE)) // line)
 
 
 def whole_bands(

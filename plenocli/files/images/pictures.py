@@ -16,7 +16,7 @@ from plenocli.base.errors import InputError
 from plenocli.base.tiling import bands
 from plenocli.files.artefacts.provenance import first_bytes
 from plenocli.files.images.exr import oiio_error, oiio_name, require_at_most
-from plenocli.files.images.in_bands import DECODED, put_together, whole_bands
+from plenocli.files.images.in_bands import put_together, rows_of, whole_bands
 from plenocli.files.outside import outside_in_parts
 from plenocli.files.seal import require_seal
 
@@ -186,7 +186,7 @@ def _decoded(path: str, kind: str, most: int | None, held: bool) -> Iterator[Any
         declared = spec.width * spec.height * spec.nchannels * size
         line = spec.width * spec.nchannels * size
         require_at_most(path, declared, most)
-        rows = min(spec.tile_height or max(1, DECODED // line), spec.height)
+        rows = min(spec.tile_height or rows_of(line), spec.height)
         budget().require_declared(path, declared, (declared if held else 0) + 4 * rows * line)
         container = 8 * size
         bits = spec.get_int_attribute("oiio:BitsPerSample", container)

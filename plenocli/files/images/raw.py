@@ -21,7 +21,7 @@ from plenocli.base.errors import InputError, PlenoError
 from plenocli.base.tiling import Plane, bands
 from plenocli.files.artefacts.provenance import require_file
 from plenocli.files.images.dng import read_notes
-from plenocli.files.images.in_bands import DECODED, Room, put_together, whole_bands
+from plenocli.files.images.in_bands import Room, put_together, rows_of, whole_bands
 from plenocli.files.outside import outside, outside_in_parts
 from plenocli.files.seal import require_seal
 from plenocli.forward.sensor.cfa import ColourProfile
@@ -167,7 +167,7 @@ def _decoded(path: str, held: bool) -> Iterator[Any]:
             budget().require_declared(path, declared, needed, why=why)
             yield {**_said(path, raw), "exif": _exif(path)}
             visible = raw.raw_image_visible
-            for rows in bands(visible.shape[0], DECODED // (2 * visible.shape[1])):
+            for rows in bands(visible.shape[0], rows_of(2 * visible.shape[1])):
                 yield visible[rows].astype("<u2")  # LibRaw frees the mosaic when it is closed
     except rawpy.LibRawError as error:
         raise InputError(_reason(error, path), path, _FIX) from None

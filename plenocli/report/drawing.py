@@ -34,8 +34,10 @@ LEVEL_MAP = "viridis"  # other positive quantities
 SIGN_MAP = "RdBu_r"  # differences, white is none
 GRID_LINE = "#56B4E9"
 DPI = 130
-THUMB = 1100
-"""Points of a side beyond which a picture is drawn from averages over blocks."""
+THUMB = 600
+"""Points of a side beyond which a picture is drawn from averages over blocks: panels have hardly
+more pixels, and matplotlib takes 60 bytes a point.
+"""
 _SAMPLE = 1 << 20
 """Values of a picture that its statistics need at most."""
 
@@ -223,17 +225,21 @@ def overview(values: "ArrayLike | Plane", limit: int = THUMB) -> Overview:
     rows, columns = (n // step * step for n in plane.shape[-2:])
     step = step if rows and columns else 1
     every = math.ceil((math.prod(plane.shape) / _SAMPLE) ** 0.5)
-    small, sample = [], []
+    lead = plane.shape[:-2]
+    small = np.empty((*lead, rows // step, columns // step) if step > 1 else plane.shape)
+    sample = np.empty((*lead, *(-(-n // every) for n in plane.shape[-2:])))
     for part in plane.in_bands(math.lcm(step, every)):
         band = plane.window(part)
-        sample.append(band[..., ::every, ::every].copy())
+        of_sample = band[..., ::every, ::every]
+        first = part.start // every
+        sample[..., first : first + of_sample.shape[-2], :] = of_sample
         whole = band[..., : max(rows - part.start, 0), :columns]
+        first, count = part.start // step, whole.shape[-2] // step
         if step == 1:
-            small.append(band)
+            small[..., part, :] = band
         elif whole.size:
-            small.append(block_mean(whole, (step, step)))
-    joined = (np.concatenate(parts, axis=-2) for parts in (small, sample))
-    return Overview(small=next(joined), step=step, sample=next(joined).reshape(-1))
+            small[..., first : first + count, :] = block_mean(whole, (step, step))
+    return Overview(small=small, step=step, sample=sample.reshape(-1))
 
 
 def nanometres(wavelength: float) -> str:

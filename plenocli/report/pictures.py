@@ -75,13 +75,14 @@ def capture_picture(
     plane = Plane.of(mosaic).through(lambda values: values - black)
     seen = overview(plane)
     top = float(np.percentile(seen.sample, 99.9)) or 1.0
+    shown, step = seen.small, seen.step
+    del seen  # its sample is as large as all that is drawn
     centres = _tiling(plane.shape, pitch) if centres is None and pitch is not None else centres
     if centres is not None and not np.isfinite(centres).all(axis=-1).any():
         centres = None
     rows, cols = plane.shape
     with drawing(10.2, 4.75) as made:
         whole, close = made.figure.subplots(1, 2)
-        shown, step = seen.small, seen.step
         if colour is not None:
             shown, step = encode_srgb(colour[0]), colour[1]
         whole.imshow(

@@ -25,7 +25,7 @@ from plenocli.files.images.mosaic import read_capture
 from plenocli.files.images.tiff_stack import read_tiff_volume, write_volume_tiff
 from plenocli.files.results.stacks import read_stack
 from plenocli.files.results.volumes import read_volume
-from plenocli.inverse.volume import measurement, superpixels
+from plenocli.inverse.volume import measurement, superpixels, tiles
 from plenocli.inverse.volume.superpixels import white_superpixel
 from plenocli.inverse.volume.tiles import Tiles
 from plenocli.inverse.volume.volume import HeldOut, Likeness, Prior, Trial, Volume
@@ -328,6 +328,13 @@ def test_a_volume_for_fiji_has_its_errors_beside_it(seen, tmp_path):
         assert np.array_equal(file.asarray()[:, 1], stored.sigma)
 
 
+def six_windows(self, count):
+    """Lenslets (rows, columns) of a window, of which there are three rows of two."""
+    halo = tiles._halo(self.stack)
+    rows, columns = (-(-(n - 2 * halo) // m) + 2 * halo for n, m in zip(count, (3, 2)))
+    return rows, columns
+
+
 @pytest.mark.parametrize("method", ["lmmse", "tv"])
 def test_a_volume_whose_parts_stay_in_files_is_that_of_all_in_memory(
     seen, tmp_path, method, monkeypatch
@@ -335,7 +342,7 @@ def test_a_volume_whose_parts_stay_in_files_is_that_of_all_in_memory(
     """The same windows; a few pixels at a time, the capture and what it is like in their files."""
     run_volume(seen / "capture.h5", tmp_path / "like.h5", seen / "stack.h5", method="rl")
     more = {"like": tmp_path / "like.h5"} if method == "tv" else {}
-    monkeypatch.setattr(Tiles, "_several", lambda self, count: (3, 2))
+    monkeypatch.setattr(Tiles, "_side", six_windows)
 
     def made(name):
         path = tmp_path / name
@@ -363,7 +370,7 @@ def test_a_volume_that_was_stopped_goes_on_from_its_windows(
     """The bytes of a run that was not stopped, with no window made twice; other settings, and a
     window that is damaged, begin anew.
     """
-    monkeypatch.setattr(Tiles, "_several", lambda self, count: (3, 2))
+    monkeypatch.setattr(Tiles, "_side", six_windows)
     solved, looked_at = [], Tiles.problem
     put, left = Bench.put, [done]
 
@@ -451,7 +458,7 @@ def same(found, wanted):
 
 def test_an_ome_tiff_without_room_is_refused_before_the_work(seen, tmp_path, monkeypatch):
     """3 planes of 14 x 12 voxels with errors, 3 times 4 bytes each, at the very limit."""
-    monkeypatch.setattr(Tiles, "_several", lambda self, count: (1, 1))
+    monkeypatch.setattr(Tiles, "_side", lambda self, count: tuple(count[:2]))
     needed = 3 * 4 * 2 * 3 * 14 * 12
     monkeypatch.setattr(Tiles, "volume", lambda self: pytest.fail("it worked"))
     monkeypatch.setattr(stage, "COPIES", stage.COPIES * (1 << 20))

@@ -27,10 +27,12 @@ from plenocli.inverse.volume.volume import HeldOut, Trial, Volume, predictive_si
 
 MOST = 10_000
 """Windows, at most."""
-SPARE = 0.125
-"""Share of the work that smaller windows may take more of: what they take of the memory is then
-much the same for all sensors.
+FULL = 0.92
+"""Of the memory of the largest windows that fit, what windows take at least: it is then much the
+same for all sensors.
 """
+DEARER = 1.5
+"""Times the least work, above which smaller windows are taken after all."""
 HELD_BYTES = 12
 """Memory for a pixel that was put aside, while windows are worked on."""
 Room = Callable[[tuple[int, ...]], Any]
@@ -99,39 +101,46 @@ class Tiles:
         self._hold_out, self._seed, self._where = hold_out, seed, where
         self.keep: Keep = made
         count = measurement.signal.shape[:2]
-        self.windows = _windows(count, self._several(count), _halo(stack))
+        self.windows = _windows(count, self._side(count), _halo(stack))
 
-    def _several(self, count: Sequence[int]) -> tuple[int, int]:
-        """Windows along rows and columns that fit: one, or of those that are hardly more work than
-        the least the smallest.
+    def _side(self, count: Sequence[int]) -> tuple[int, int]:
+        """Lenslets (rows, columns) of a window: all where they fit, else, of the windows that take
+        nearly as much memory as the largest that fit, those that are the least work.
         """
         halo, reach = _halo(self.stack), self.stack.reach
         pixels, planes = self.stack.A.shape[1], len(self.stack.depth)
         unknowns = planes * self.stack.A.shape[2]
         kept = HELD_BYTES * self._hold_out * math.prod(count) * pixels + self.stack.A.nbytes
-        fewest, fitting = math.inf, dict[tuple[int, int], tuple[int, int]]()
-        for rows in range(1, count[0] + 1):
-            for columns in range(1, count[1] + 1):
-                if rows * columns > min(2 * fewest, MOST):
+
+        def needed(side: tuple[int, int]) -> float:
+            torus = torus_for(side, reach)
+            return kept + _needed(self.method, pixels, unknowns, planes, torus)
+
+        every, smallest = (count[0], count[1]), (_least(count[0], halo), _least(count[1], halo))
+        if needed(every) <= budget().memory:
+            return every
+        fitting = dict[tuple[int, int], tuple[float, int]]()
+        for rows in _sides(count[0], halo, lambda n: torus_for((n, 1), reach)[0]):
+            for columns in _sides(count[1], halo, lambda n: torus_for((1, n), reach)[1]):
+                side = rows, columns
+                if (taken := needed(side)) > budget().memory:
                     break
-                size = _size(count[0], rows, halo), _size(count[1], columns, halo)
-                torus = torus_for(size, reach)
-                if _needed(self.method, pixels, unknowns, planes, torus) + kept <= budget().memory:
-                    fewest = min(fewest, rows * columns)
-                    fitting[rows, columns] = torus
+                several = math.prod(_several(n, s, halo) for n, s in zip(count, side))
+                if several <= MOST:
+                    fitting[side] = taken, several * math.prod(torus_for(side, reach))
         if not fitting:
-            smallest = _size(count[0], count[0], halo), _size(count[1], count[1], halo)
             budget().require(
-                kept + _needed(self.method, pixels, unknowns, planes, torus_for(smallest, reach)),
+                max(needed(smallest), budget().memory + 1),
                 f"the map of {smallest[0]} x {smallest[1]} lenslets",
                 self._where,
                 "take fewer planes or voxels",
             )
-        if fewest == 1:
-            return 1, 1
-        areas = {several: math.prod(torus) for several, torus in fitting.items()}
-        most = (1 + SPARE) * min(math.prod(several) * area for several, area in areas.items())
-        return min((s for s in areas if math.prod(s) * areas[s] <= most), key=areas.__getitem__)
+        least, most = (pick(row[n] for row in fitting.values()) for n, pick in ((1, min), (0, max)))
+        full = [side for side, (taken, _) in fitting.items() if taken >= FULL * most]
+        side = min(full, key=lambda side: fitting[side][1])
+        if fitting[side][1] > DEARER * least:
+            return min(fitting, key=lambda side: fitting[side][1])
+        return side
 
     @cached_property
     def _op(self) -> BlockCirculant:
@@ -311,16 +320,27 @@ def _halo(stack: Stack) -> int:
     return int(away.max())
 
 
-def _size(count: int, several: int, halo: int) -> int:
-    """Lenslets along an axis of each of several windows."""
-    return min(count, math.ceil((count - 2 * halo) / several) + 2 * halo) if several > 1 else count
+def _least(count: int, halo: int) -> int:
+    """Lenslets along an axis of the smallest windows."""
+    return min(count, 2 * halo + 1)
 
 
-def _windows(count: Sequence[int], several: tuple[int, int], halo: int) -> list[Window]:
+def _several(count: int, side: int, halo: int) -> int:
+    """Windows of `side` lenslets along an axis of `count`."""
+    return 1 if side >= count else math.ceil((count - 2 * halo) / (side - 2 * halo))
+
+
+def _sides(count: int, halo: int, torus: Callable[[int], int]) -> list[int]:
+    """Lenslets along an axis of windows, rising: of those on a torus of one length the largest."""
+    largest = {torus(n): n for n in range(_least(count, halo), count + 1)}
+    return sorted(largest.values())
+
+
+def _windows(count: Sequence[int], side: tuple[int, int], halo: int) -> list[Window]:
     """Windows of one size, row by row."""
     axes = []
-    for n, many in zip(count, several):
-        size = _size(n, many, halo)
+    for n, size in zip(count, side):
+        many = _several(n, size, halo)
         starts = sorted({round(i * (n - size) / max(many - 1, 1)) for i in range(many)})
         axes.append([(slice(a, a + size), _weights(a, size, n, halo)) for a in starts])
     return [

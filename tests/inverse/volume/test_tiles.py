@@ -58,9 +58,15 @@ def tiled(stack, measurement, method, memory=1 << 40, like=None):
         return found, found.volume()
 
 
+def side_of(count, several, halo):
+    """Lenslets (rows, columns) of the smallest windows of which `several` cover an array."""
+    sides = (n if m == 1 else -(-(n - 2 * halo) // m) + 2 * halo for n, m in zip(count, several))
+    return tuple(min(side, n) for side, n in zip(sides, count))
+
+
 def memory_of(method, several, count=COUNT, halo=1):
     """Bytes with which windows as many as this fit, and no fewer."""
-    size = [tiles._size(n, m, halo) for n, m in zip(count, several)]
+    size = side_of(count, several, halo)
     kernels = sum(4 * blocks.size for blocks, _ in volumes.kernels(2, 4, 9))
     kept = tiles.HELD_BYTES * 0.1 * np.prod(count) * 9 + kernels
     return math.ceil(tiles._needed(method, 9, 8, 2, tiles.torus_for(tuple(size), (1, 1))) + kept)
@@ -68,9 +74,8 @@ def memory_of(method, several, count=COUNT, halo=1):
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
-    """Chunks, and no windows smaller than need be."""
+    """Chunks."""
     monkeypatch.setattr("plenocli.base.linear_maps.CHUNK", 1 << 10)
-    monkeypatch.setattr(tiles, "SPARE", 0.0)
 
 
 @pytest.mark.parametrize("method", ["rl", "lmmse", "tv"])
@@ -129,7 +134,8 @@ def test_a_pixel_is_put_aside_in_every_window_that_has_it(stack, measurement):
 @pytest.mark.parametrize("several", [(1, 1), (2, 3), (5, 1), (4, 4)])
 @pytest.mark.parametrize("halo", [0, 1, 3])
 def test_windows_cover_the_array_and_overlap_by_two_halos(count, several, halo):
-    windows = tiles._windows(count, several, halo)
+    windows = tiles._windows(count, side_of(count, several, halo), halo)
+    assert len(windows) <= math.prod(several)
     weights, sizes = np.zeros(count), set()
     for window in windows:
         weights[window.rows, window.columns] += window.weight
@@ -188,26 +194,55 @@ def test_the_volume_of_all_windows_is_the_weighted_mean_of_theirs(
     assert all(told[i] == pytest.approx(held[i][1], abs=1e-5) for i in told)
 
 
-def test_windows_fit_and_are_the_least_work(stack, measurement):
-    """Against all splits, one by one."""
+def area(side):
+    return math.prod(tiles.torus_for(tuple(side), (1, 1)))
+
+
+def test_windows_fit_fill_the_memory_and_are_then_the_least_work(stack, measurement):
+    """Against all sizes, one by one."""
     count = 60, 75
     whole = replace(measurement, signal=np.ones((*count, 9)))
-    for share in (0.9, 0.4, 0.2):
+    for share in (0.9, 0.6, 0.4, 0.2):
         memory = int(share * memory_of("rl", (1, 1), count))
         with within(Budget(memory)):
             found = Tiles(stack, whole, "rl", hold_out=0.1, seed=1).windows
-        work = {}
-        for rows in range(1, 61):
-            for columns in range(1, 76):
-                if memory_of("rl", (rows, columns), count) <= memory:
-                    size = [tiles._size(n, m, 1) for n, m in zip(count, (rows, columns))]
-                    area = math.prod(tiles.torus_for(tuple(size), (1, 1)))
-                    work[rows, columns] = rows * columns * area
-        area = math.prod(tiles.torus_for(found[0].weight.shape, (1, 1)))
-        assert len(found) * area == min(work.values())
-        assert (
-            tiles._needed("rl", 9, 8, 2, tiles.torus_for(found[0].weight.shape, (1, 1))) <= memory
+        kept = memory_of("rl", (1, 1), count) - tiles._needed(
+            "rl", 9, 8, 2, tiles.torus_for(count, (1, 1))
         )
+        every = {}
+        for side in np.ndindex(61, 76):
+            if min(side) < 3:
+                continue
+            taken = kept + tiles._needed("rl", 9, 8, 2, tiles.torus_for(side, (1, 1)))
+            if taken <= memory:
+                step = [n if s == n else s - 2 for n, s in zip(count, side)]
+                several = [1 if s == n else -(-(n - 2) // d) for n, s, d in zip(count, side, step)]
+                every[side] = taken, math.prod(several) * area(side)
+        most = max(taken for taken, _ in every.values())
+        side = found[0].weight.shape
+        full = min(work for taken, work in every.values() if taken >= tiles.FULL * most)
+        least = min(work for _, work in every.values())
+        dear = full > tiles.DEARER * least
+        assert dear == (share == 0.9)
+        assert len(found) * area(side) == (least if dear else full)
+        assert dear or every[side][0] >= tiles.FULL * most
+
+
+@pytest.mark.parametrize("method", ["rl", "lmmse"])
+def test_windows_take_as_much_whatever_the_array(stack, measurement, method):
+    """From the first array on that does not fit: its own share of what was put aside apart."""
+    memory = memory_of(method, (1, 1), (40, 44))
+    taken = []
+    for rows, columns in ((64, 64), (90, 90), (100, 70), (128, 128), (181, 181), (256, 256)):
+        values = np.broadcast_to(np.float32(1), (rows, columns, 9))
+        with within(Budget(memory)):
+            found = Tiles(
+                stack, replace(measurement, signal=values), method, hold_out=1e-6, seed=1
+            ).windows
+        assert len(found) > 1
+        torus = tiles.torus_for(found[0].weight.shape, (1, 1))
+        taken.append(tiles._needed(method, 9, 8, 2, torus))
+    assert max(taken) <= memory and max(taken) < 1.1 * min(taken)
 
 
 def test_what_does_not_fit_even_so_is_refused(stack, measurement):

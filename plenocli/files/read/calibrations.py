@@ -46,6 +46,8 @@ IMAGES = {"white/flat", "dark/mean"}
 """Datasets with a value for every pixel of the sensor."""
 LARGE = {"response/F", "response/white", "dark/mean"}
 """Datasets that may stay in the file."""
+UNREAD = tuple(f"response/{name}" for name in ("F", "covariance", "polarised", "energy"))
+"""Of a response, which those do not need who have the superpixels of white."""
 
 
 def read_calibration(
@@ -76,9 +78,8 @@ def read_images(path: str | Path, *, small: bool = False, superpixels: bool = Fa
 
     Raises InputError where the file cannot be read.
     """
-    unread = [f"response/{name}" for name in ("F", "covariance", "polarised", "energy")]
     wanted = IMAGES | ({"response/white"} if superpixels else set())
-    unread += [] if superpixels else ["response/white"]
+    unread = [*UNREAD, *([] if superpixels else ["response/white"])]
     apart, large = (unread, wanted) if small else ([*wanted, *unread], set())
     with opened_artefact(path, "calibration", apart, large=large) as (artefact, stored):
         for name in stored.keys() & wanted:
@@ -86,6 +87,21 @@ def read_images(path: str | Path, *, small: bool = False, superpixels: bool = Fa
             kept: Any = Plane(values.shape, values.window)
             artefact.data[name] = kept if name in IMAGES else _in_file(values, told_apart=False)
     return calibration_of(artefact, response=False)
+
+
+def read_white(path: str | Path, *, in_file: bool = False) -> Calibration:
+    """What a calibration artefact knows of lenslets, the superpixels of white, and dark.
+
+    in_file: whether these two stay in the file where they are not small.
+
+    Raises InputError where the file cannot be read, or lacks one of them.
+    """
+    large = LARGE if in_file else ()
+    with opened_artefact(path, "calibration", [*UNREAD, *WHITE_IMAGE], large=large) as found:
+        artefact, stored = found
+        for name in stored.keys() & LARGE - {*UNREAD}:
+            artefact.data[name] = _in_file(stored[name], told_apart=False)
+    return calibration_of(_sound(artefact, path, ("windows", "white", "dark")), response=False)
 
 
 def read_described(

@@ -18,9 +18,8 @@ from plenocli.base.errors import InputError
 from plenocli.base.progress import collected_notes
 from plenocli.files.artefacts.provenance import require_file
 from plenocli.files.images.mosaic import StoredCapture, read_capture, stored_capture
-from plenocli.files.read.calibrations import read_calibration
+from plenocli.files.read.calibrations import read_white
 from plenocli.files.scratch import Scratch
-from plenocli.inverse.calibration.calibration import Calibration
 from plenocli.inverse.picture.lenslet_model import LensletMatrix, Superpixels
 from plenocli.inverse.picture.superpixels import superpixels
 from plenocli.inverse.picture.tiles import EVERY, Area, Source
@@ -112,11 +111,6 @@ def read_superpixels(
     return superpixels(
         capture, system, read_white(calibration), where=calibration, each_pixel=each_pixel
     )
-
-
-def read_white(path: str | Path) -> Calibration:
-    """What a calibration artefact knows of lenslets, white and dark."""
-    return read_calibration(path, needs=("windows", "white", "dark"), response=False)
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,8 @@ from typing import Protocol
 
 import numpy as np
 
+from plenocli.base.tiling import EVERYTHING, Plane
+
 
 class CutByWindow(Protocol):
     """What gives its pixels by windows, such as plenocli.forward.sensor.readout.Readout."""
@@ -66,3 +68,13 @@ def extract(
         view = np.lib.stride_tricks.sliding_window_view(mosaic, window)
         out[good] = view[tuple(origin[good].T)].reshape(-1, window[0] * window[1])
     return out
+
+
+def extract_rows(image: Plane, origin: np.ndarray, window: tuple[int, int]) -> np.ndarray:
+    """As `extract`, of an image of which no more rows are read than are needed."""
+    there = inside(origin, window, image.shape)
+    rows = origin[there, 0]
+    first, last = (int(rows.min()), int(rows.max())) if rows.size else (0, 0)
+    seen = image.read(slice(first, last + window[0]), EVERYTHING)
+    own = np.where(there[..., None], origin - (first, 0), -1)
+    return extract(seen, own, window)

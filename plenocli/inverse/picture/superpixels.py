@@ -12,11 +12,11 @@ import numpy as np
 from plenocli.base.errors import InputError
 from plenocli.base.progress import note
 from plenocli.base.text import by
-from plenocli.base.tiling import to_blocks
+from plenocli.base.tiling import EVERYTHING, Plane, to_blocks
 from plenocli.forward.propagation.accuracy_record import AccuracyRecord
 from plenocli.forward.sensor.frames import saturated
 from plenocli.forward.sensor.noise import Noise
-from plenocli.forward.sensor.superpixel import extract
+from plenocli.forward.sensor.superpixel import extract, extract_rows
 from plenocli.inverse.calibration.calibration import there
 from plenocli.inverse.picture.lenslet_model import LensletMatrix, Superpixels
 from plenocli.inverse.picture.nuisances.vignetting import falloff
@@ -84,20 +84,24 @@ def superpixels(
     )
 
 
-def windows_of(capture: Capture, calibration: Calibration) -> tuple[np.ndarray, np.ndarray]:
+def windows_of(
+    capture: Capture, calibration: Calibration, rows: slice = EVERYTHING
+) -> tuple[np.ndarray, np.ndarray]:
     """Windows of a capture and of the white reference along the grid of a calibration.
 
     calibration: with windows, white and dark.
+    rows: of lenslets; of a capture, white and dark in files no more are read.
 
     Returns (signal, white), (lenslet_row, lenslet_column, pixel) each, dark subtracted; NaN where a
     superpixel is not wholly on the sensor.
     Raises InputError where the two sensors differ.
     """
     windows = there(calibration.windows)
-    signal = extract(above_dark(capture, calibration), windows.origin, windows.shape)
-    signal[~calibration.grid.valid] = np.nan
+    light = Plane(capture.shape, lambda some, _: above_dark(capture, calibration, some))
+    signal = extract_rows(light, windows.origin[rows], windows.shape)
+    signal[~calibration.grid.valid[rows]] = np.nan
     white = there(there(calibration.white).superpixels)
-    return signal, np.broadcast_to(white, signal.shape)
+    return signal, np.broadcast_to(white if white.ndim == 1 else white[rows], signal.shape)
 
 
 def _along_the_grid(

@@ -17,7 +17,7 @@ from plenocli.base.tiling import EVERYTHING, Plane, bands, in_cells, in_lenslets
 from plenocli.forward.sensor.capture import SuperpixelGrid
 from plenocli.forward.sensor.cfa import cfa_map
 from plenocli.forward.sensor.frames import saturated
-from plenocli.forward.sensor.superpixel import extract, inside
+from plenocli.forward.sensor.superpixel import extract_rows
 from plenocli.inverse.calibration.calibration import there
 from plenocli.inverse.picture.real_light import (
     DUST,
@@ -239,15 +239,6 @@ def _ends(values: np.ndarray) -> np.ndarray:
     return np.array([known.min(), known.max()] if known.size else [0.0, 0.0])
 
 
-def _extracted(image: Plane, origin: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """As `extract`, of an image of which no more rows are read than are needed."""
-    there = inside(origin, shape, image.shape)
-    first, last = _ends(origin[there, 0]).astype(int)
-    seen = image.read(slice(first, last + shape[0]), EVERYTHING)
-    own = np.where(there[..., None], origin - (first, 0), -1)
-    return extract(seen, own, shape)
-
-
 def _bins(step: tuple[float, float]) -> tuple[int, int]:
     """Whole pixels of the sensor (rows, columns) in one of the kernels."""
     return max(1, round(step[0])), max(1, round(step[1]))
@@ -312,7 +303,7 @@ def _tiled(capture: Capture, shape: tuple[int, int], lattice: str, channel: str)
     image = Plane(capture.shape, usable)
     return _Superpixels(
         count=(rows, columns),
-        cut=lambda some: _extracted(image, origin[some], shape) / unit,
+        cut=lambda some: extract_rows(image, origin[some], shape) / unit,
         read_variance=0.0 if noise is None else noise.without_signal / unit**2,
         gain=0.0 if noise is None else noise.gain / unit,
     )
@@ -410,7 +401,7 @@ def _beside_white(
     windows, white = there(calibration.windows), there(there(calibration.white).superpixels)
     pixels = math.prod(windows.shape)
     for rows in bands(len(lit), AT_ONCE // (pixels * lit.shape[1])):
-        raw = _extracted(light, windows.origin[rows], windows.shape)
+        raw = extract_rows(light, windows.origin[rows], windows.shape)
         seen = np.broadcast_to(white if white.ndim == 1 else white[rows], raw.shape)
         yield raw, seen, np.isfinite(raw) & np.isfinite(seen) & lit[rows, :, None]
 

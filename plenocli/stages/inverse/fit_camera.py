@@ -84,7 +84,7 @@ def run_fit_camera(
     """
     from plenocli.files.atomic import publish, together
     from plenocli.files.images.mosaic import read_capture
-    from plenocli.files.read.captures import read_white
+    from plenocli.files.read.calibrations import read_white
     from plenocli.files.read.training import files_of
     from plenocli.inverse.fit.captures import believed_model, captured_lenslets
     from plenocli.inverse.fit.causes import beyond_parameters

@@ -12,14 +12,14 @@ import numpy as np
 
 from plenocli.base.errors import InputError, UsageError
 from plenocli.base.progress import note
-from plenocli.base.tiling import to_blocks
+from plenocli.base.tiling import Plane, bands, to_blocks
 from plenocli.execution.pool import InProcess, Pool
-from plenocli.files.read.captures import (
-    read_white,
-    superpixel_source,
-)
+from plenocli.files.read.calibrations import read_white
+from plenocli.files.read.captures import room_beside, superpixel_source
 from plenocli.files.read.system_matrices import FieldMatrix
-from plenocli.inverse.calibration.calibration import there
+from plenocli.forward.sensor.cfa import cfa_map
+from plenocli.forward.sensor.superpixel import extract_rows
+from plenocli.inverse.calibration.calibration import Windows, there
 from plenocli.inverse.picture.diagnosis import Seen
 from plenocli.inverse.picture.estimate import estimate
 from plenocli.inverse.picture.estimators import Estimators
@@ -51,6 +51,10 @@ from plenocli.stages.inverse.reconstruct.solved import Solved
 
 if TYPE_CHECKING:
     from plenocli.forward.accuracy.limiting_error import Limits
+    from plenocli.forward.sensor.capture import Capture
+
+BAND = 1 << 20
+"""Pixels of superpixels that are summed at a time."""
 
 
 def reconstruct_capture(
@@ -67,15 +71,14 @@ def reconstruct_capture(
     pool: for tiles, None for this process.
     far: whether what lies there is not found by who writes the result.
     """
-    settings = recipe.settings
+    settings, where = recipe.settings, None if far else targets.get(capture)
     if recipe.pif is None and recipe.calibration is not None:
         choice = Choice(method="block-mean", reason="sum over the superpixel, over that of white")
-        value, rgb = _white_normalised(capture, recipe.calibration)
+        value, rgb = _white_normalised(capture, recipe.calibration, where)
         found = Reconstruction(value=value, method=choice.method, trace=(choice,))
         return _solved(found, settings, rgb=rgb)
     estimators, method = estimators_of(recipe), METHODS[settings.method]
     system = estimators.system
-    where = None if far else targets.get(capture)
     with superpixel_source(
         capture, system, recipe.calibration, each_pixel=method.each_pixel, beside=where
     ) as source:
@@ -193,36 +196,51 @@ def _truth(
     return to_blocks(picture, shape)
 
 
-def _white_normalised(capture: Path, calibration: Path) -> tuple[np.ndarray, np.ndarray | None]:
+def _white_normalised(
+    capture: Path, calibration: Path, beside: Path | None
+) -> tuple[np.ndarray, np.ndarray | None]:
     """One value a lenslet (lenslet_row, lenslet_column): the superpixel's sum over that of the
     white reference; 0 where it cannot be had. Of pixels with colours also linear sRGB (3,
     lenslet_row, lenslet_column), each colour's sum over its own of white.
 
     Pixels that the calibration masked (dead, or under dust) are left out of both sums.
+    beside: as of superpixel_source.
     """
-    from plenocli.files.images.mosaic import read_capture
-    from plenocli.forward.sensor.cfa import cfa_map
-    from plenocli.forward.sensor.superpixel import extract
+    from plenocli.files.images.mosaic import capture_in_file
 
-    shot, known = read_capture(capture), read_white(calibration)
-    signal, white = windows_of(shot, known)
-    usable = np.isfinite(signal) & np.isfinite(white)
-
-    def share(counted: np.ndarray) -> np.ndarray:
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return np.where(counted, signal, 0).sum(2) / np.where(counted, white, 0).sum(2)
-
-    value, rgb = share(usable), None
+    shot = capture_in_file(capture, room=room_beside(beside))
+    known = read_white(calibration, in_file=True)
+    rgb_too = shot.cfa != "mono" and not set("RGB") - set(shot.cfa)
+    count, pixels = known.grid.valid.shape, int(np.prod(there(known.windows).shape))
+    value, own = np.empty(count), np.empty((3, *count))
+    for rows in bands(count[0], BAND // (pixels * count[1])):
+        signal, white = windows_of(shot, known, rows)
+        usable = np.isfinite(signal) & np.isfinite(white)
+        value[rows] = _share(signal, white, usable)
+        for number, letter in enumerate("RGB" if rgb_too else ()):
+            lit = usable & _of_colour(shot, there(known.windows), rows, letter)
+            own[number, rows] = np.nan_to_num(_share(signal, white, lit), posinf=0.0)
+    rgb = own if shot.profile is None else np.tensordot(shot.profile.to_rgb, own, axes=1)
     lost = ~np.isfinite(value)
-    if shot.cfa != "mono" and not set("RGB") - set(shot.cfa):
-        windows = there(known.windows)
-        colour = cfa_map((shot.shape[0], shot.shape[1]), shot.cfa)
-        places = [extract(colour == letter, windows.origin, windows.shape) == 1 for letter in "RGB"]
-        own = np.nan_to_num(np.stack([share(usable & place) for place in places]), posinf=0.0)
-        rgb = own if shot.profile is None else np.tensordot(shot.profile.to_rgb, own, axes=1)
     if lost.any():
         note(
             f"{Path(capture).name}: {int(lost.sum())} of {lost.size} lenslets lie partly off the "
             "sensor or are dark; they are 0 in the picture"
         )
-    return np.where(lost, 0, value), rgb
+    return np.where(lost, 0, value), rgb if rgb_too else None
+
+
+def _share(signal: np.ndarray, white: np.ndarray, counted: np.ndarray) -> np.ndarray:
+    """Of each superpixel (row, column, pixel), the sum of what counts over that of white."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(counted, signal, 0).sum(2) / np.where(counted, white, 0).sum(2)
+
+
+def _of_colour(shot: Capture, windows: Windows, rows: slice, letter: str) -> np.ndarray:
+    """Which pixels of some rows of windows are of one colour, (row, column, pixel)."""
+
+    def places(some: slice, _: slice) -> np.ndarray:
+        first, last, _ = some.indices(shot.shape[0])
+        return cfa_map((last - first, shot.shape[1]), shot.cfa, (first % 2, 0)) == letter
+
+    return extract_rows(Plane(shot.shape, places), windows.origin[rows], windows.shape) == 1

@@ -212,22 +212,24 @@ def _white_normalised(
     known = read_white(calibration, in_file=True)
     rgb_too = shot.cfa != "mono" and not set("RGB") - set(shot.cfa)
     count, pixels = known.grid.valid.shape, int(np.prod(there(known.windows).shape))
-    value, own = np.empty(count), np.empty((3, *count))
+    values, colours = [], []
     for rows in bands(count[0], BAND // (pixels * count[1])):
         signal, white = windows_of(shot, known, rows)
         usable = np.isfinite(signal) & np.isfinite(white)
-        value[rows] = _share(signal, white, usable)
-        for number, letter in enumerate("RGB" if rgb_too else ()):
-            lit = usable & _of_colour(shot, there(known.windows), rows, letter)
-            own[number, rows] = np.nan_to_num(_share(signal, white, lit), posinf=0.0)
-    rgb = own if shot.profile is None else np.tensordot(shot.profile.to_rgb, own, axes=1)
+        values.append(_share(signal, white, usable))
+        lit = (_of_colour(shot, there(known.windows), rows, n) for n in ("RGB" if rgb_too else ""))
+        colours.append([np.nan_to_num(_share(signal, white, usable & n), posinf=0.0) for n in lit])
+    value, rgb = np.concatenate(values), None
+    if rgb_too:
+        rgb = np.concatenate([np.stack(own) for own in colours], axis=1)
+        rgb = rgb if shot.profile is None else np.tensordot(shot.profile.to_rgb, rgb, axes=1)
     lost = ~np.isfinite(value)
     if lost.any():
         note(
             f"{Path(capture).name}: {int(lost.sum())} of {lost.size} lenslets lie partly off the "
             "sensor or are dark; they are 0 in the picture"
         )
-    return np.where(lost, 0, value), rgb if rgb_too else None
+    return np.where(lost, 0, value), rgb
 
 
 def _share(signal: np.ndarray, white: np.ndarray, counted: np.ndarray) -> np.ndarray:

@@ -4,6 +4,7 @@ system matrix.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
@@ -17,11 +18,17 @@ from plenocli.base.budget import budget
 from plenocli.base.errors import InputError
 from plenocli.base.progress import collected_notes
 from plenocli.files.artefacts.provenance import require_file
-from plenocli.files.images.mosaic import StoredCapture, read_capture, stored_capture
+from plenocli.files.images.in_bands import SHARE
+from plenocli.files.images.mosaic import (
+    StoredCapture,
+    capture_in_file,
+    read_capture,
+    stored_capture,
+)
 from plenocli.files.read.calibrations import read_white
 from plenocli.files.scratch import Scratch
 from plenocli.inverse.picture.lenslet_model import LensletMatrix, Superpixels
-from plenocli.inverse.picture.superpixels import superpixels
+from plenocli.inverse.picture.superpixels import AlongTheGrid, superpixels
 from plenocli.inverse.picture.tiles import EVERY, Area, Source
 
 if TYPE_CHECKING:
@@ -191,7 +198,7 @@ def superpixel_source(
     asked for.
 
     beside: the result, in whose folder a file that cannot be read in parts is decoded to one that
-        can, where it is large; None: it is held.
+        can, where it is large, and superpixels along a grid are kept; None: they are held.
     verify: as of plenocli.files.artefacts.reading.opened_artefact; a file that was verified before
         is opened once.
     """
@@ -201,6 +208,10 @@ def superpixel_source(
         if _divides(system.pixel_shape, windows.capture):
             yield _Stored(windows, system)
             return
+    elif not each_pixel:
+        files = Path(path), Path(calibration)
+        yield _along_the_grid(*files, _Same(system), beside, tuple(map(_stamp, files)))
+        return
     yield _Held(read_superpixels(path, system, calibration, each_pixel=each_pixel))
 
 
@@ -210,6 +221,36 @@ def room_beside(target: Path | None) -> Scratch | None:
     Raises OutputError where nothing can be put there.
     """
     return None if target is None or not target.parent.is_dir() else Scratch(target)
+
+
+@dataclass(frozen=True, eq=False)
+class _Same:
+    """A system matrix, which is equal to itself alone."""
+
+    matrix: LensletMatrix
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Same) and other.matrix is self.matrix
+
+    def __hash__(self) -> int:
+        return id(self.matrix)
+
+
+@lru_cache(maxsize=1)
+def _along_the_grid(
+    path: Path, calibration: Path, system: _Same, beside: Path | None, stamps: object
+) -> AlongTheGrid:
+    """Superpixels along the grid of a calibration, which take a while: tiles have them in common.
+
+    stamps: of both files.
+    """
+    room = room_beside(beside)
+    capture = capture_in_file(path, room=room)
+    numbers = 8 * math.prod(capture.shape)
+    is_held = room is None or numbers <= budget().memory // SHARE
+    known = read_white(calibration, in_file=True)
+    kept = np.empty if is_held else room
+    return AlongTheGrid(capture, system.matrix, known, calibration, kept)
 
 
 def _windows(path: Path, beside: Path | None, *, verify: bool = True) -> _Windows:

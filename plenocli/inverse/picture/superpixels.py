@@ -5,27 +5,30 @@ white: tiled, or cut out along the grid of a calibration.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from plenocli.base.errors import InputError
 from plenocli.base.progress import note
 from plenocli.base.text import by
-from plenocli.base.tiling import EVERYTHING, Plane, to_blocks
+from plenocli.base.tiling import EVERYTHING, Plane, bands, to_blocks
 from plenocli.forward.propagation.accuracy_record import AccuracyRecord
 from plenocli.forward.sensor.frames import saturated
 from plenocli.forward.sensor.noise import Noise
-from plenocli.forward.sensor.superpixel import extract, extract_rows
+from plenocli.forward.sensor.superpixel import extract_rows
 from plenocli.inverse.calibration.calibration import there
 from plenocli.inverse.picture.lenslet_model import LensletMatrix, Superpixels
-from plenocli.inverse.picture.nuisances.vignetting import falloff
+from plenocli.inverse.picture.nuisances.vignetting import Room, falloff_in_bands
 from plenocli.inverse.picture.real_light import above_dark, along_the_grid
+from plenocli.inverse.picture.tiles import EVERY, Area
 
 if TYPE_CHECKING:
     from plenocli.forward.sensor.capture import Capture
     from plenocli.inverse.calibration.calibration import Calibration
 
+AT_ONCE = 1 << 20
+"""Pixels that are worked on at a time."""
 TOLD = 0.01
 """Difference between the white image and the matrix's, root mean square, that is told."""
 
@@ -50,15 +53,11 @@ def superpixels(
     Raises InputError where sizes disagree or the scale is not known.
     """
     path = capture.metadata.path
-    if capture.cfa != "mono":
-        raise InputError(
-            f"has the colour filter array {capture.cfa}; the system matrix knows none",
-            path,
-            "use --calibration with --method block-mean, or demux",
-        )
+    _require_grey(capture)
     if calibration is not None:
-        cut_out = along_the_grid if each_pixel else _along_the_grid
-        return cut_out(capture, system, calibration, where)
+        if each_pixel:
+            return along_the_grid(capture, system, calibration, where)
+        return AlongTheGrid(capture, system, calibration, where).cut(*EVERY)
     light = capture.metadata.illuminant
     if system.illuminant and light and light != system.illuminant:
         note(
@@ -84,6 +83,15 @@ def superpixels(
     )
 
 
+def _require_grey(capture: Capture) -> None:
+    if capture.cfa != "mono":
+        raise InputError(
+            f"has the colour filter array {capture.cfa}; the system matrix knows none",
+            capture.metadata.path,
+            "use --calibration with --method block-mean, or demux",
+        )
+
+
 def windows_of(
     capture: Capture, calibration: Calibration, rows: slice = EVERYTHING
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -104,37 +112,93 @@ def windows_of(
     return signal, np.broadcast_to(white if white.ndim == 1 else white[rows], signal.shape)
 
 
-def _along_the_grid(
-    capture: Capture, system: LensletMatrix, calibration: Calibration, where: str | Path | None
-) -> Superpixels:
-    """Superpixels in units of A x, by the light of a white object; NaN where a pixel is off the
-    sensor, or bad to the calibration.
+class AlongTheGrid:
+    """Superpixels in units of A x, by the light of a white object, NaN where a pixel is off the
+    sensor, or bad to the calibration; worked out in bands of lenslets, and cut when they are asked
+    for.
+
+    capture, calibration: what of them stays in files is read in bands.
+    system, where: as of superpixels.
+    room: for numbers of a shape and dtype, put and looked at by slices.
+
+    Raises InputError where sizes differ, or for a sensor with colours.
     """
-    signal, white = windows_of(capture, calibration)
-    if signal.shape[2] != system.own.shape[0]:
-        wholly = np.mod(there(calibration.windows).shape, system.pixel_shape) == 0
-        raise InputError(
-            f"holds windows of {signal.shape[2]} pixels, the system matrix {system.own.shape[0]}",
-            where,
-            "simulate-pif with pixels_per_lenslet as measured"
-            + (", or take --method weighted, which bins pixels" if wholly.all() else ""),
-        )
-    even = system.blocks.sum(axis=(0, 2), dtype=float)
-    known = np.isfinite(signal) & np.isfinite(white)
-    relative = np.where(known, white * _brightness(white, even, known)[:, :, None], np.nan)
-    flat = falloff(relative.reshape(-1, even.size), even, system.pixel_shape).reshape(signal.shape)
-    known &= np.isfinite(flat)
-    scale = _brightness(white, even * flat, known)
-    off = np.where(known, (flat - 1) ** 2, 0.0).mean(axis=(0, 1))
-    away = float(np.sqrt(np.average(off, weights=even)))
-    if away > TOLD:
-        note(
-            f"{capture.name}: within superpixels a white object's light differs by {away:.1%} from "
-            "what the system matrix expects (vignetting, or a matrix that is not quite this "
-            "camera's): it is divided out by the white image"
-        )
-    y = np.where(known, signal, np.nan) * (scale[:, :, None] / flat)
-    return Superpixels(y=y, saturated=_clipped(capture, calibration))
+
+    def __init__(
+        self,
+        capture: Capture,
+        system: LensletMatrix,
+        calibration: Calibration,
+        where: str | Path | None,
+        room: Room = np.empty,
+    ) -> None:
+        _require_grey(capture)
+        self.count: tuple[int, int] = calibration.grid.valid.shape
+        self.pixels = int(np.prod(there(calibration.windows).shape))
+        if self.pixels != system.own.shape[0]:
+            wholly = np.mod(there(calibration.windows).shape, system.pixel_shape) == 0
+            raise InputError(
+                f"holds windows of {self.pixels} pixels, the system matrix {system.own.shape[0]}",
+                where,
+                "simulate-pif with pixels_per_lenslet as measured"
+                + (", or take --method weighted, which bins pixels" if wholly.all() else ""),
+            )
+        rows = bands(self.count[0], AT_ONCE // (self.pixels * self.count[1]))
+        even, columns = system.blocks.sum(axis=(0, 2), dtype=float), self.count[1]
+        white = room((self.count[0] * columns, self.pixels), np.dtype(float))
+        lenslets = [slice(some.start * columns, some.stop * columns) for some in rows]
+        for some, own in zip(rows, lenslets):
+            _, light, known = _known_windows(capture, calibration, some)
+            relative = light * _brightness(light, even, known)[:, :, None]
+            white[own, :] = np.where(known, relative, np.nan).reshape(-1, self.pixels)
+        flat = falloff_in_bands(white, even, system.pixel_shape, lenslets, room)
+        self._y = white  # which nobody needs any more
+        self._clipped = None
+        if np.isfinite(_white_level(capture, calibration)):
+            self._clipped = room((self.count[0] * columns, self.pixels), np.dtype(bool))
+        off = np.zeros(self.pixels)
+        for some, own in zip(rows, lenslets):
+            signal, light, known = _known_windows(capture, calibration, some)
+            falls = flat[own, :].reshape(signal.shape)
+            known &= np.isfinite(falls)
+            scale = _brightness(light, even * falls, known)
+            off += np.where(known, (falls - 1) ** 2, 0.0).sum(axis=(0, 1))
+            y = np.where(known, signal, np.nan) * (scale[:, :, None] / falls)
+            self._y[own, :] = y.reshape(-1, self.pixels)
+            if self._clipped is not None:
+                self._clipped[own, :] = _clipped(capture, calibration, some)
+        away = float(np.sqrt(np.average(off / np.prod(self.count), weights=even)))
+        if away > TOLD:
+            note(
+                f"{capture.name}: within superpixels a white object's light differs by {away:.1%} "
+                "from what the system matrix expects (vignetting, or a matrix that is not quite "
+                "this camera's): it is divided out by the white image"
+            )
+
+    def cut(self, rows: slice, columns: slice, own: Area = EVERY) -> Superpixels:
+        """As of plenocli.inverse.picture.tiles.Source."""
+        first, last, _ = rows.indices(self.count[0])
+        lenslets = slice(first * self.count[1], last * self.count[1])
+        shape = last - first, self.count[1], self.pixels
+
+        def part(values: Any) -> np.ndarray:
+            return values[lenslets, :].reshape(shape)[:, columns]
+
+        clipped = None if self._clipped is None else part(self._clipped)
+        return Superpixels(y=part(self._y), saturated=clipped, own=own)
+
+
+def _known_windows(
+    capture: Capture, calibration: Calibration, rows: slice
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Windows of a capture and of white, and where both are numbers."""
+    signal, white = windows_of(capture, calibration, rows)
+    return signal, white, np.isfinite(signal) & np.isfinite(white)
+
+
+def _white_level(capture: Capture, calibration: Calibration) -> float:
+    """Where the sensor saturates; infinite where nobody says."""
+    return min(capture.levels.white, calibration.sensor.white_level)
 
 
 def _brightness(white: np.ndarray, even: np.ndarray, known: np.ndarray) -> np.ndarray:
@@ -147,16 +211,16 @@ def _brightness(white: np.ndarray, even: np.ndarray, known: np.ndarray) -> np.nd
     return np.divide(expected, light, out=np.zeros_like(light), where=light > 0)
 
 
-def _clipped(capture: Capture, calibration: Calibration) -> np.ndarray | None:
-    """Which pixels of the windows are saturated, (lenslet_row, lenslet_column, pixel); None where
-    nobody says where the sensor saturates.
-    """
-    white = min(capture.levels.white, calibration.sensor.white_level)
-    if not np.isfinite(white):
-        return None
-    windows = there(calibration.windows)
-    clipped = saturated(capture.mosaic, capture.levels.black, white).astype(float)
-    return extract(clipped, windows.origin, windows.shape) == 1
+def _clipped(capture: Capture, calibration: Calibration, rows: slice) -> np.ndarray:
+    """Which pixels of the windows of some rows of lenslets are saturated, (lenslet, pixel)."""
+    windows, white = there(calibration.windows), _white_level(capture, calibration)
+
+    def over(some: slice, _: slice) -> np.ndarray:
+        part = capture.window(some, EVERYTHING)
+        return saturated(part.mosaic, part.levels.black, white)
+
+    cut = extract_rows(Plane(capture.shape, over), windows.origin[rows], windows.shape)
+    return (cut == 1).reshape(-1, cut.shape[2])
 
 
 def _tiles(capture: Capture, system: LensletMatrix, path: Path | None) -> tuple[int, int]:

@@ -4,6 +4,9 @@ that the matrix predicts.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from typing import Any
+
 import numpy as np
 
 SEEN = 0.1
@@ -20,6 +23,10 @@ ROUNDS = 3
 """Of what lenslets have of their own and in common, in turn."""
 STEEPEST = 4.0
 """Factor beyond which no pixel is brightened or darkened."""
+LEAST = 16
+"""Pixels that are looked at together, at least."""
+Room = Callable[[tuple[int, ...], np.dtype], Any]
+"""What gives room for values of a shape and dtype, put and looked at by slices."""
 
 
 def falloff(white: np.ndarray, even: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
@@ -36,19 +43,54 @@ def falloff(white: np.ndarray, even: np.ndarray, shape: tuple[int, int]) -> np.n
     Returns (lenslet, pixel), 1 on average, and everywhere where there is nothing to divide out; NaN
         where a pixel is not smooth at all, as dead ones are and those under dust.
     """
+    return falloff_in_bands(white, even, shape, [slice(0, len(white))], np.empty)[:]
+
+
+def falloff_in_bands(
+    white: Any, even: np.ndarray, shape: tuple[int, int], lenslets: Sequence[slice], room: Room
+) -> Any:
+    """As falloff, of white that may stay in a file.
+
+    lenslets: bands that are worked on one after the other.
+    room: for values of a shape and dtype, put and looked at by slices.
+
+    Returns what is looked at by slices of lenslets.
+    """
     bright = even > SEEN * even.max()
-    ratio = np.where(bright, white, np.nan) / np.where(bright, even, 1.0)
     inner, common = even > PUPIL * even.max(), np.ones(even.size)
-    bad = np.zeros(white.shape, bool)
-    for _ in range(ROUNDS):
-        good = np.where(bad, np.nan, ratio)
-        own = _smooth(np.where(inner, good, np.nan) / common, even, shape)
-        common = _common(good / own)
-        far = ratio / (own * common)
-        seen = np.where(np.isfinite(far).any(axis=1, keepdims=True), far, 1.0)
-        middle = np.nanmedian(seen, axis=1, keepdims=True)
-        bad = np.abs(far - middle) > BAD * middle
-    return np.where(bad, np.nan, np.clip(own * common, 1 / STEEPEST, STEEPEST))
+    bad, own = room(white.shape, np.dtype(bool)), room(white.shape, np.dtype(float))
+    apart = room(white.shape[::-1], np.dtype(float))
+    groups = max(1, min(len(lenslets), even.size // LEAST))
+    ends = np.linspace(0, even.size, groups + 1).astype(int).tolist()
+    pixels = [slice(first, last) for first, last in zip(ends[:-1], ends[1:])]
+
+    def ratio(some: slice) -> np.ndarray:
+        return np.where(bright, white[some, :], np.nan) / np.where(bright, even, 1.0)
+
+    for number in range(ROUNDS):
+        away = []
+        for some in lenslets:
+            good = np.where(bad[some, :], np.nan, ratio(some)) if number else ratio(some)
+            fitted, off = _smooth(np.where(inner, good, np.nan) / common, even, shape)
+            own[some, :] = fitted
+            away.append(off)
+        told = np.concatenate(away)
+        is_smooth = not told.size or float(np.median(told)) < TYPICAL
+        for some in lenslets:
+            good = np.where(bad[some, :], np.nan, ratio(some)) if number else ratio(some)
+            if is_smooth:
+                own[some, :] = np.ones_like(good)
+            apart[:, some] = (good / own[some, :]).T
+        common = np.concatenate([_common(np.ascontiguousarray(apart[k, :].T)) for k in pixels])
+        for some in lenslets:
+            far = ratio(some) / (own[some, :] * common)
+            seen = np.where(np.isfinite(far).any(axis=1, keepdims=True), far, 1.0)
+            middle = np.nanmedian(seen, axis=1, keepdims=True)
+            bad[some, :] = np.abs(far - middle) > BAD * middle
+    for some in lenslets:
+        light = np.clip(own[some, :] * common, 1 / STEEPEST, STEEPEST)
+        own[some, :] = np.where(bad[some, :], np.nan, light)
+    return own
 
 
 def _common(ratio: np.ndarray) -> np.ndarray:
@@ -70,9 +112,12 @@ def _common(ratio: np.ndarray) -> np.ndarray:
     return 1 + excess * np.maximum(1 - unsure / np.maximum(excess**2, 1e-300), 0.0)
 
 
-def _smooth(ratio: np.ndarray, even: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+def _smooth(
+    ratio: np.ndarray, even: np.ndarray, shape: tuple[int, int]
+) -> tuple[np.ndarray, np.ndarray]:
     """Quadratics of the place through ratios (lenslet, pixel), NaN where unknown; by least
-    squares, weighted by the even light; 1 on average, and everywhere where that is TYPICAL.
+    squares, weighted by the even light; 1 on average. And how far they are from 1, root mean
+    square, of those lenslets that have one.
     """
     rows, columns = np.meshgrid(*(np.linspace(-1, 1, n) for n in shape), indexing="ij")
     place = np.stack([rows.ravel(), columns.ravel()])
@@ -90,6 +135,4 @@ def _smooth(ratio: np.ndarray, even: np.ndarray, shape: tuple[int, int]) -> np.n
     sound = told & (level > 0)
     fitted = np.where(sound[:, None], fitted / np.where(sound, level, 1)[:, None], 1.0)
     away = np.sqrt((weight * (fitted - 1) ** 2).sum(axis=1) / total)
-    if not sound.any() or np.median(away[sound]) < TYPICAL:
-        return np.ones_like(ratio)
-    return np.clip(fitted, 1 / STEEPEST, STEEPEST)
+    return np.clip(fitted, 1 / STEEPEST, STEEPEST), away[sound]

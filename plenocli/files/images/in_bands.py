@@ -5,6 +5,7 @@ beside it, in a file.
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -34,7 +35,7 @@ def rows_of(line: int) -> int:
 
 
 def whole_bands(
-    path: str | Path, parts: Iterable[Any], shape: tuple[int, ...]
+    path: str | os.PathLike[str], parts: Iterable[Any], shape: tuple[int, ...]
 ) -> Iterator[np.ndarray]:
     """Bands of rows that a decoder sends; InputError where they are not those of a picture of a
     shape (row, column, ...).

@@ -233,7 +233,8 @@ def _capture_of(path: Path, artefact: Artefact, mosaic: np.ndarray) -> Capture:
 
 
 def _from_exr(path: Path, room: Room | None) -> Capture:
-    header, channels = (None if room is None else read_header(path)), {}
+    header = None if room is None else read_header(path)
+    channels: dict[str, np.ndarray] = {}
     size = 0 if header is None else 4 * math.prod(header.shape)
     if header is None or not header.by_lines or size <= budget().memory // SHARE:
         header, (channels, attrs) = None, read_exr(path)
@@ -347,8 +348,9 @@ def _whole(numbers: Any) -> tuple[int, ...] | None:
 def _from_raw(path: Path, source: str, found: RawFile) -> Capture:
     with _sensible(path):
         told = _told(path, source, found.details, found.gain)
+    mosaic: Any = found.values
     return Capture(
-        mosaic=found.values,
+        mosaic=mosaic,
         cfa=found.cfa,
         levels=Levels(black=found.black, white=found.white, gain=found.gain),
         exposure_s=found.exposure_s,

@@ -10,7 +10,7 @@ from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -249,7 +249,7 @@ def _along_the_grid(
     numbers = 8 * math.prod(capture.shape)
     is_held = room is None or numbers <= budget().memory // SHARE
     known = read_white(calibration, in_file=True)
-    kept = np.empty if is_held else room
+    kept: Any = np.empty if is_held else room
     return AlongTheGrid(capture, system.matrix, known, calibration, kept)
 
 

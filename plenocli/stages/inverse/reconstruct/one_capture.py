@@ -242,7 +242,7 @@ def _of_colour(shot: Capture, windows: Windows, rows: slice, letter: str) -> np.
     """Which pixels of some rows of windows are of one colour, (row, column, pixel)."""
 
     def places(some: slice, _: slice) -> np.ndarray:
-        first, last, _ = some.indices(shot.shape[0])
+        first, last, __ = some.indices(shot.shape[0])
         return cfa_map((last - first, shot.shape[1]), shot.cfa, (first % 2, 0)) == letter
 
     return extract_rows(Plane(shot.shape, places), windows.origin[rows], windows.shape) == 1

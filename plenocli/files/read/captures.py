@@ -9,6 +9,7 @@ from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
+from threading import Lock
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -142,19 +143,23 @@ class _Windows:
     def __init__(self, capture: StoredCapture) -> None:
         self.capture = capture
         self._rows: tuple[slice, np.ndarray] | None = None
+        # threads read in turn: those that work meanwhile need no decoder of their own
+        self._turn = Lock()
 
     def read(self, rows: slice, columns: slice) -> Capture:
         """That of some pixels. Raises InputError."""
         mosaic = self.capture.mosaic
         size = (rows.stop - rows.start) * mosaic.shape[1] * mosaic.dtype.itemsize
-        if size > KEPT_SHARE * budget().memory:
-            return self.capture.window(rows, columns)
-        if self._rows is None or self._rows[0] != rows:
-            self._rows = None  # not two at a time
-            values = mosaic.window(rows)
-            values.flags.writeable = False
-            self._rows = rows, values
-        return self.capture.holding(self._rows[1][:, columns], rows, columns)
+        with self._turn:
+            if size > KEPT_SHARE * budget().memory:
+                return self.capture.window(rows, columns)
+            if self._rows is None or self._rows[0] != rows:
+                self._rows = None  # not two at a time
+                values = mosaic.window(rows)
+                values.flags.writeable = False
+                self._rows = rows, values
+            values = self._rows[1]
+        return self.capture.holding(values[:, columns], rows, columns)
 
 
 class _Stored:
@@ -177,9 +182,9 @@ class _Stored:
         )
         part = self.windows.read(*pixels)
         # what there is to say of all of it is said once
-        with collected_notes() if self._said else nullcontext():
+        said, self._said = self._said, True
+        with collected_notes() if said else nullcontext():
             found = superpixels(part, self.system)
-        self._said = True
         return replace(found, own=own)
 
 

@@ -46,8 +46,9 @@ def run_reconstruct(
 ) -> ReconstructSummary:
     """Reconstruct every capture.
 
-    Several go to settings.workers processes, or to a Dask cluster; so do batches of the lenslets of
-    a single one, by methods that take long over each. Finished ones are skipped unless overwrite.
+    Several go to settings.workers processes, or to a Dask cluster; so do tiles of a single one, or
+    batches of its lenslets by methods that take long over each, or to as many threads where these
+    serve as well. Finished ones are skipped unless overwrite.
     One that fails does not stop the others; an error with the worst exit code follows at the end.
 
     captures: files, folders of them, or patterns (plenocli.files.read.captures.named_captures).
@@ -83,7 +84,8 @@ def run_reconstruct(
     try:
         if pif:  # a broken one ends the run here, before any capture
             estimators_of(recipe) if split or not pooled else system_of(recipe)
-        with open_pool(workers, scheduler) as pool:
+        threads = split and method.in_threads
+        with open_pool(workers, scheduler, threads=threads) as pool:
             if split and pooled and pif:
                 estimators_of(recipe).elsewhere = partial(solve_in_pool, recipe, pool)
             tasks = pool if split else InProcess()

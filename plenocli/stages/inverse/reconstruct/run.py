@@ -5,10 +5,12 @@ neighbours.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+from plenocli.base.budget import budget, within
 from plenocli.base.errors import UsageError
 from plenocli.execution.batch import BatchSummary, outcomes, plan_batch, summarise
 from plenocli.execution.pool import InProcess, open_pool
@@ -79,7 +81,9 @@ def run_reconstruct(
 
     def write(solved: Solved, capture: Path, target: Path) -> PictureSummary:
         inputs = _inputs(settings, capture, pif, calibration)
-        return write_picture(target, solved, settings, command, inputs, overwrite)
+        # of a single one nothing is estimated any more
+        with within(replace(budget(), threads=settings.workers if split else 1)):
+            return write_picture(target, solved, settings, command, inputs, overwrite)
 
     try:
         if pif:  # a broken one ends the run here, before any capture

@@ -98,11 +98,15 @@ def test_tiles_give_the_picture_of_the_whole(folder, tmp_path, monkeypatch, name
     assert sorted(p.name for p in tmp_path.iterdir()) == ["tiled.h5", "whole.h5"]
 
 
-def test_results_do_not_depend_on_workers(folder, tmp_path, small_tiles):
+@pytest.mark.parametrize(
+    ("kind", "method"), [("coupled", "lmmse"), ("alone", "lmmse"), ("alone", "tv")]
+)
+def test_results_do_not_depend_on_workers(folder, tmp_path, small_tiles, kind, method):
+    # threads of lmmse, processes of tv
     made, _ = folder
     for workers in ("1", "2"):
         found = picture(
-            made / "coupled", tmp_path / f"{workers}.h5", "--workers", workers, method="lmmse"
+            made / kind, tmp_path / f"{workers}.h5", "--workers", workers, method=method
         )
         assert found.data["image/value"].shape == (COUNT * N, COUNT * N)
     assert (tmp_path / "1.h5").read_bytes() == (tmp_path / "2.h5").read_bytes()

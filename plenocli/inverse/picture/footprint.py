@@ -207,6 +207,25 @@ def require_reconstruction(
     )
 
 
+def pieces_at_once(
+    estimators: Estimators, lenslets: int, phases: Phases, *, joint: bool, most: int
+) -> int:
+    """How many pieces of `lenslets`, `most` at most, the memory holds, in as many threads of this
+    process; one where there is no room for more.
+
+    phases, joint: as in `reconstruction`.
+    """
+    system = estimators.system
+    # threads share all that does not go with lenslets
+    sizes = Sizes.of(system, lenslets, min(MOST, *system.own.shape), 0)
+    for count in range(most, 1, -1):
+        # what another one made waits to be kept while it is at the next
+        together = replace(sizes, lenslets=(2 * count - 1) * lenslets)
+        if reconstruction(together, phases, joint=joint) <= budget().memory:
+            return count
+    return 1
+
+
 def _directions(own: np.ndarray, sigma: float) -> int:
     """Singular vectors of `own` (pixel, point) whose signal can exceed a hundredth of the noise,
     about: of photographs of a standard deviation of 0.25.

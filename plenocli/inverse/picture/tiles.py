@@ -105,6 +105,11 @@ def tiles_of(estimators: Estimators, method: Method, count: tuple[int, int]) -> 
     ]
 
 
+def largest_tile(estimators: Estimators, method: Method) -> int:
+    """Lenslets that are looked at for the largest tile that there may be."""
+    return (side_of(estimators.system) + 2 * _margin(estimators, method)) ** 2
+
+
 def _even(count: int, most: int) -> list[slice]:
     """`count` in parts of `most` at most, as long as each other."""
     return bands(count, -(-count // -(-count // most)))

@@ -21,7 +21,7 @@ from plenocli.files.read.captures import superpixel_source
 from plenocli.inverse.picture.diagnosis import Seen
 from plenocli.inverse.picture.estimate import estimate
 from plenocli.inverse.picture.estimators import Estimators
-from plenocli.inverse.picture.footprint import cleaned, require_reconstruction
+from plenocli.inverse.picture.footprint import cleaned, pieces_at_once, require_reconstruction
 from plenocli.inverse.picture.lenslet_model import Superpixels, Whole
 from plenocli.inverse.picture.methods.method import Sees
 from plenocli.inverse.picture.methods.registry import METHODS
@@ -31,6 +31,7 @@ from plenocli.inverse.picture.tiles import (
     Source,
     Tile,
     joined,
+    largest_tile,
     side_of,
     spread_over,
     survey,
@@ -79,6 +80,19 @@ def picture_in_tiles(
         block=system.object_shape,
         bands=system.bands,
         bench=bench,
+    )
+
+
+def tiles_at_once(recipe: Recipe) -> int:
+    """How many of its workers, threads of this process, the memory holds with a tile each."""
+    estimators, method = estimators_of(recipe), METHODS[recipe.settings.method]
+    look = method.sees is not Sees.LENSLET_AS_IS
+    return pieces_at_once(
+        estimators,
+        largest_tile(estimators, method),
+        cleaned(method.phases) if look else method.phases,
+        joint=method.makes_joint_estimate(estimators),
+        most=recipe.settings.workers,
     )
 
 

@@ -20,6 +20,7 @@ from plenocli.files.read.captures import (
 )
 from plenocli.files.read.training import files_of
 from plenocli.inverse.picture.methods.registry import METHODS, takers
+from plenocli.stages.inverse.reconstruct.in_tiles import tiles_at_once
 from plenocli.stages.inverse.reconstruct.one_capture import reconstruct_capture
 from plenocli.stages.inverse.reconstruct.recipe import (
     Settings,
@@ -89,6 +90,8 @@ def run_reconstruct(
         if pif:  # a broken one ends the run here, before any capture
             estimators_of(recipe) if split or not pooled else system_of(recipe)
         threads = split and method.in_threads
+        if threads and pif:
+            workers = min(workers, tiles_at_once(recipe))
         with open_pool(workers, scheduler, threads=threads) as pool:
             if split and pooled and pif:
                 estimators_of(recipe).elsewhere = partial(solve_in_pool, recipe, pool)

@@ -21,8 +21,10 @@ import numpy as np
 from plenocli.base.errors import OutputError
 from plenocli.base.tiling import BAND, EVERYTHING, InParts, bands
 from plenocli.files.atomic import write_at
+from plenocli.files.bench import Bench
 
 DTYPE = np.dtype(np.float32)
+_STAYS = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,21 +76,30 @@ class Scratch:
     """Room for pictures of float32, (..., row, column), by their shapes.
 
     where: the result, in whose folder the file is.
+    bench: where the file has a name and stays, so that a later run that asks for the same shapes
+        finds there what was put.
 
     Raises OutputError where that cannot be made or written.
     """
 
-    def __init__(self, where: Path) -> None:
+    def __init__(self, where: Path, bench: Bench | None = None) -> None:
         self.where, self._size = where, 0
+        if bench is not None:
+            bench.make()
         with self.told():
-            self.file: IO[bytes] = tempfile.TemporaryFile(dir=where.parent)
+            self.file: IO[bytes] = (
+                tempfile.TemporaryFile(dir=where.parent)
+                if bench is None
+                else open(os.open(bench.path("pictures"), _STAYS, 0o600), "r+b")
+            )
         weakref.finalize(self, self.file.close)
 
     def __call__(self, shape: tuple[int, ...]) -> ScratchRows:
         begin = self._size
         self._size += math.prod(shape) * DTYPE.itemsize
         with self.told():
-            os.ftruncate(self.file.fileno(), self._size)
+            if os.fstat(self.file.fileno()).st_size < self._size:
+                os.ftruncate(self.file.fileno(), self._size)
         parts = partial(self._read, shape, begin)
         return ScratchRows(shape=shape, dtype=DTYPE, parts=parts, scratch=self, begin=begin)
 

@@ -16,6 +16,9 @@ from plenocli import __version__
 from plenocli.base.errors import OutputError
 from plenocli.files.kept import read_arrays, write_arrays
 
+DIGITS = 16
+"""Of the digest in a folder's name."""
+
 
 @dataclass(frozen=True)
 class Bench:
@@ -37,7 +40,7 @@ class Bench:
 
         depends: all that tiles depend on, beside the code; its repr counts.
         """
-        digest = hashlib.sha256(f"{__version__} {depends!r}".encode()).hexdigest()[:16]
+        digest = hashlib.sha256(f"{__version__} {depends!r}".encode()).hexdigest()[:DIGITS]
         folder = target.with_name(f".{target.name}.{digest}.tiles")
         clear(target, but=folder)
         return cls(folder, target)
@@ -76,6 +79,7 @@ class Bench:
 
 def clear(target: Path, but: Path | None = None) -> None:
     """Remove the folders of tiles that killed runs towards a result left; but: one of them."""
-    for folder in target.parent.glob(f".{glob.escape(target.name)}.*.tiles"):
+    digest = "[0-9a-f]" * DIGITS  # and not *, which results of longer names have
+    for folder in target.parent.glob(f".{glob.escape(target.name)}.{digest}.tiles"):
         if folder != but:
             shutil.rmtree(folder, ignore_errors=True)

@@ -12,7 +12,7 @@ import tempfile
 import weakref
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import IO, Any
 
@@ -83,16 +83,21 @@ class Scratch:
     """
 
     def __init__(self, where: Path, bench: Bench | None = None) -> None:
-        self.where, self._size = where, 0
-        if bench is not None:
-            bench.make()
+        self.where, self._bench, self._size = where, bench, 0
+
+    @cached_property
+    def file(self) -> IO[bytes]:
+        """Opened once there are pictures, so that a run that fails before leaves nothing."""
+        if self._bench is not None:
+            self._bench.make()
         with self.told():
-            self.file: IO[bytes] = (
-                tempfile.TemporaryFile(dir=where.parent)
-                if bench is None
-                else open(os.open(bench.path("pictures"), _STAYS, 0o600), "r+b")
+            file = (
+                tempfile.TemporaryFile(dir=self.where.parent)
+                if self._bench is None
+                else open(os.open(self._bench.path("pictures"), _STAYS, 0o600), "r+b")
             )
-        weakref.finalize(self, self.file.close)
+        weakref.finalize(self, file.close)
+        return file
 
     def __call__(self, shape: tuple[int, ...]) -> ScratchRows:
         begin = self._size

@@ -1,5 +1,5 @@
 """Pictures that are made bit by bit and may not fit the memory: in a nameless file until they are
-written.
+written, or in one on a bench, where a later run finds them.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ _STAYS = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
 @dataclass(frozen=True, kw_only=True)
 class ScratchRows(InParts):
     """InParts of which rows of the last two axes are put and looked at first, in any order, by an
-    index that ends with a slice of rows, or of rows and of columns; zero where nothing was put.
-    Errors as Scratch.
+    index that ends with a slice of rows, or of rows and of columns; zero where nothing was put, in
+    a file on a bench by no run before either. Errors as Scratch.
 
     scratch: where they are.
     begin: byte of its file.

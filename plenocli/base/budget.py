@@ -11,6 +11,7 @@ import contextlib
 import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from contextvars import copy_context
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -173,5 +174,6 @@ def spread(parts: Sequence[tuple], work: Callable[..., object]) -> None:
         from concurrent.futures import ThreadPoolExecutor
 
         with ThreadPoolExecutor(threads) as pool:
-            for done in [pool.submit(work, *part) for part in parts]:
+            # each in what is set where it is asked for: whoever collects notes gets theirs
+            for done in [pool.submit(copy_context().run, work, *part) for part in parts]:
                 done.result()

@@ -18,11 +18,14 @@ import numpy as np
 
 from plenocli.base.budget import spread
 from plenocli.base.device import CPU, Device, namespace
+from plenocli.base.tiling import bands
 
 CHUNK = 1 << 25
 """Bytes of kernels that are transformed at a time."""
 CACHED = 4
 """Frequencies whose matrices are multiplied while they are in the processor's cache."""
+COLUMNS = 256
+"""That a matrix is multiplied with at a time: enough for the processor's full speed."""
 
 
 @dataclass(frozen=True)
@@ -311,6 +314,19 @@ def times_adjoint(matrices: Any, y: Any) -> Any:
 
     spread(_shares(len(matrices)), work)
     return x
+
+
+def product(matrix: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """matrix (m, n) times columns (n, count), some columns at a time on the threads of the budget:
+    the same numbers however many there are.
+    """
+    made = np.empty((len(matrix), columns.shape[1]), np.result_type(matrix, columns))
+
+    def work(part: slice) -> None:
+        np.matmul(matrix, columns[:, part], out=made[:, part])
+
+    spread([(part,) for part in bands(columns.shape[1], COLUMNS)], work)
+    return made
 
 
 def _shares(count: int) -> list[tuple[slice]]:

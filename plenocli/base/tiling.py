@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -108,6 +108,53 @@ class InParts:
 
 
 EVERYTHING = slice(None)
+
+
+class Keeper(Protocol):
+    """What keeps the arrays of finished tiles by their names, for a run that comes after one that
+    was killed.
+    """
+
+    def get(self, tile: str) -> Sequence[np.ndarray] | None:
+        """The arrays of a tile, None of one that is not finished."""
+        ...
+
+    def put(self, tile: str, arrays: Sequence[np.ndarray]) -> None:
+        """Keep a finished tile, as float64."""
+        ...
+
+    def under(self, name: str) -> Keeper:
+        """That of other tiles, which may be called as those here are."""
+        ...
+
+
+class _Forgetful:
+    """A Keeper that keeps nothing."""
+
+    def get(self, tile: str) -> None:
+        """None."""
+
+    def put(self, tile: str, arrays: Sequence[np.ndarray]) -> None:
+        """Forget it."""
+
+    def under(self, name: str) -> _Forgetful:
+        """The same."""
+        return self
+
+
+FORGETFUL: Keeper = _Forgetful()
+"""Keeps nothing."""
+
+
+def kept(
+    keeper: Keeper, tile: str, make: Callable[[], Sequence[np.ndarray]]
+) -> Sequence[np.ndarray]:
+    """The arrays of a tile: as an earlier run left them, else as they are made, which is left."""
+    found = keeper.get(tile)
+    if found is None:
+        found = make()
+        keeper.put(tile, found)
+    return found
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,5 @@
 """Pictures that are made or read bit by bit and may not fit the memory: in a nameless file as long
-as they are worked on.
+as they are worked on, or in one on a bench, where a later run finds them.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import tempfile
 import weakref
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import IO, Any
 
@@ -21,15 +21,17 @@ import numpy as np
 from plenocli.base.errors import OutputError
 from plenocli.base.tiling import BAND, EVERYTHING, InParts, bands
 from plenocli.files.atomic import write_at
+from plenocli.files.bench import Bench
 
 DTYPE = np.dtype(np.float32)
+_STAYS = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
 
 
 @dataclass(frozen=True, kw_only=True)
 class ScratchRows(InParts):
     """InParts of which rows of the last two axes are put and looked at first, in any order, by an
-    index that ends with a slice of rows, or of rows and of columns; zero where nothing was put.
-    Errors as Scratch.
+    index that ends with a slice of rows, or of rows and of columns; zero where nothing was put, in
+    a file on a bench by no run before either. Errors as Scratch.
 
     scratch: where they are.
     begin: byte of its file.
@@ -74,21 +76,35 @@ class Scratch:
     """Room for pictures (..., row, column) by their shapes, of float32 or another dtype.
 
     where: the result, in whose folder the file is.
+    bench: where the file has a name and stays, so that a later run that asks for the same shapes
+        finds there what was put.
 
     Raises OutputError where that cannot be made or written.
     """
 
-    def __init__(self, where: Path) -> None:
-        self.where, self._size = where, 0
+    def __init__(self, where: Path, bench: Bench | None = None) -> None:
+        self.where, self._bench, self._size = where, bench, 0
+
+    @cached_property
+    def file(self) -> IO[bytes]:
+        """Opened once there are pictures, so that a run that fails before leaves nothing."""
+        if self._bench is not None:
+            self._bench.make()
         with self.told():
-            self.file: IO[bytes] = tempfile.TemporaryFile(dir=where.parent)
-        weakref.finalize(self, self.file.close)
+            file = (
+                tempfile.TemporaryFile(dir=self.where.parent)
+                if self._bench is None
+                else open(os.open(self._bench.path("pictures"), _STAYS, 0o600), "r+b")
+            )
+        weakref.finalize(self, file.close)
+        return file
 
     def __call__(self, shape: tuple[int, ...], dtype: np.dtype = DTYPE) -> ScratchRows:
         begin = self._size
         self._size += math.prod(shape) * dtype.itemsize
         with self.told():
-            os.ftruncate(self.file.fileno(), self._size)
+            if os.fstat(self.file.fileno()).st_size < self._size:
+                os.ftruncate(self.file.fileno(), self._size)
         parts = partial(self._read, shape, dtype, begin)
         return ScratchRows(shape=shape, dtype=dtype, parts=parts, scratch=self, begin=begin)
 

@@ -5,7 +5,8 @@ that it never forms.
 import numpy as np
 import pytest
 
-from plenocli.base.linear_maps import BlockCirculant, BlockToeplitz, torus_for
+from plenocli.base.budget import Budget, within
+from plenocli.base.linear_maps import BlockCirculant, BlockToeplitz, product, torus_for
 from tests.reference.adjoints import Dense, adjoint_gap
 
 OFFSETS = np.array([[r, c] for r in (-1, 0, 1) for c in (-1, 0, 1)])
@@ -180,3 +181,15 @@ def test_shapes_are_checked():
         block_map().forward(np.zeros((3, 4, 5)))
     with pytest.raises(ValueError, match="twice"):
         BlockToeplitz(np.zeros((2, 3, 3)), [[0, 0], [0, 0]], (2, 2))
+
+
+@pytest.mark.parametrize("count", [1, 255, 257, 1000])
+def test_products_are_the_same_on_any_number_of_threads(count):
+    rng = np.random.default_rng(count)
+    matrix, signals = rng.standard_normal((70, 90)), rng.standard_normal((count, 90))
+    made = []
+    for threads in (1, 3):
+        with within(Budget(1 << 30, threads)):
+            made.append(product(matrix, signals.T))
+    np.testing.assert_allclose(made[0], np.einsum("pk,nk->pn", matrix, signals), atol=1e-12)
+    assert made[0].tobytes() == made[1].tobytes()

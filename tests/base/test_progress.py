@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from plenocli.base.budget import Budget, spread, within
 from plenocli.base.progress import bar, collected_notes, note, repeats_counted
 from plenocli.cli.main import run
 
@@ -31,3 +32,9 @@ def test_notes_that_repeat_are_counted(capsys):
     assert told[1] == "plenocli: another thing"
     assert told[2].startswith("plenocli: 45 times in all") and told[2].endswith(told[0][10:])
     assert len(told) == 4
+
+
+def test_notes_of_threads_are_those_of_whoever_asked(capsys):
+    with within(Budget(1 << 30, threads=3)), collected_notes() as said:
+        spread([(str(number),) for number in range(5)], note)
+    assert sorted(said) == ["0", "1", "2", "3", "4"] and not capsys.readouterr().err

@@ -48,7 +48,7 @@ def test_parts_of_rows_are_put_and_added_to_as_in_an_array(tmp_path):
 
 def test_a_file_that_cannot_be_made_or_written_is_an_output_error(monkeypatch, tmp_path):
     with pytest.raises(OutputError, match="its pictures cannot be kept beside it"):
-        Scratch(tmp_path / "gone" / "out.h5")
+        Scratch(tmp_path / "gone" / "out.h5")((2, 4, 4))
     room = Scratch(tmp_path / "out.h5")((2, 4, 4))
 
     def full(*arguments):

@@ -1,6 +1,8 @@
 """demux tile by tile, from files of which a part is in memory at a time: what comes out is what
-comes out of one piece.
+comes out of one piece, and a run that was stopped goes on from its tiles.
 """
+
+import shutil
 
 import numpy as np
 import pytest
@@ -18,14 +20,17 @@ from plenocli.files.artefacts.writing import write_artefact
 from plenocli.files.read.calibrations import read_described, write_calibration
 from plenocli.forward.sensor.frames import Dark
 from plenocli.inverse.calibration.calibration import Calibration, Response, Sensor, White, Windows
+from plenocli.inverse.spectra.radiance import _Estimation
 from plenocli.stages.inverse.demux import Settings, run_demux
 from tests.reference.calibrations import lenslet_grid
+from tests.stages.stopped import damage, interrupted, kept, killed
 
 SIDE, ROWS, COLUMNS, FRAME = 16, 9, 7, 18
 SHAPE = (ROWS * SIDE + 2 * FRAME, COLUMNS * SIDE + 2 * FRAME)
 DEAD = (4, 2)
 CORNERS = FRAME + SIDE * np.stack(np.indices((ROWS, COLUMNS)), axis=-1)
 CENTRES = CORNERS + (SIDE - 1) / 2
+TILES = {"BLOCK_NUMBERS": (5 * SIDE**2,) * 2, "TILE_NUMBERS": 10 * SIDE**2}
 
 
 def superpixels(moved):
@@ -110,8 +115,8 @@ def test_tiles_give_what_one_piece_gives(files, tmp_path, monkeypatch, shot, met
         error = whole["spectra/value"] - np.moveaxis(files[1], -1, 0)
         assert np.sqrt(np.nanmean(error**2)) < 0.01
     monkeypatch.setattr(reading, "SHARE", 1 << 40)
-    monkeypatch.setattr(factored, "BLOCK_NUMBERS", (5 * SIDE**2,) * 2)
-    monkeypatch.setattr(factored, "TILE_NUMBERS", 10 * SIDE**2)
+    for name, value in TILES.items():
+        monkeypatch.setattr(factored, name, value)
     monkeypatch.setattr(readout, "BAND", 37 * SHAPE[1])
     calls = []
     read = reading.Stored.part
@@ -174,3 +179,112 @@ def test_a_response_to_polarised_light_may_stay_in_its_file(files, tmp_path):
     with within(Budget(16 * f.nbytes // 2)):
         found, _ = read_described(tmp_path / "c.h5", needs=("response",), in_file=True)
     np.testing.assert_array_equal(found.response.matrix, f)
+
+
+@pytest.fixture
+def made(monkeypatch):
+    """Names of the tiles that were made, of which there are many."""
+    answer, found = _Estimation._answer, []
+
+    def counted(self, part, method):
+        found.append(f"{self.keeper.prefix}{part.start}-{part.stop}")
+        return answer(self, part, method)
+
+    monkeypatch.setattr(_Estimation, "_answer", counted)
+    for name, value in TILES.items():
+        monkeypatch.setattr(factored, name, value)
+    return found
+
+
+def demux(folder, output, shot="moved", **settings):
+    """The bytes of one result."""
+    run_demux(
+        [folder / f"{shot}.h5"],
+        output,
+        calibration=folder / "c.h5",
+        settings=Settings(**settings),
+        overwrite=True,
+    )
+    return output.read_bytes()
+
+
+@pytest.mark.parametrize("tiles, how", [(5, "cut"), (15, "bit")])
+def test_a_run_that_was_stopped_makes_no_tile_twice(files, tmp_path, made, tiles, how):
+    """Looks at a capture that moved, and the others that are compared with it, each have theirs;
+    a tile that is damaged is made again.
+    """
+    whole = demux(files[0], tmp_path / "o.h5")
+    every = list(made)
+    assert len(set(every)) == len(every) >= 20 and not kept(tmp_path / "o.h5")
+    (tmp_path / "o.h5").unlink()
+    made.clear()
+    interrupted(lambda: demux(files[0], tmp_path / "o.h5"), tiles)
+    there = kept(tmp_path / "o.h5")
+    assert len(there) == tiles and {"prior", "capture.auto.errors"} < there.keys()
+    assert made == [name for name in every if name in there] and len(made) > 1
+    lost = made[1]
+    damage(there[lost], how)
+    made.clear()
+    assert demux(files[0], tmp_path / "o.h5") == whole
+    assert made == [name for name in every if name not in there or name == lost]
+    assert [file.name for file in tmp_path.iterdir()] == ["o.h5"]
+
+
+@pytest.mark.parametrize("files", ["own"], indirect=True)
+def test_tiles_of_another_run_are_neither_taken_nor_left(files, tmp_path, made):
+    folder, output = tmp_path / "files", tmp_path / "o.h5"
+    shutil.copytree(files[0], folder)
+    demux(folder, output, method="lmmse", register="off")
+    every = list(made)
+    for other in ({"method": "wls"}, {"shot": "still"}, {"register": "auto"}):
+        interrupted(lambda other=other: demux(folder, output, **other), 6)
+        made.clear()
+        demux(folder, output, method="lmmse", register="off")
+        assert made == every and not kept(output)
+    interrupted(lambda: demux(folder, output), 6)
+    (folder / "still.h5").rename(folder / "moved.h5")  # other pixels by the same name
+    made.clear()
+    demux(folder, output)
+    assert len(made) == len(every) and not kept(output)
+
+
+@pytest.mark.parametrize("files", ["own"], indirect=True)
+def test_a_white_reference_has_tiles_of_its_own(files, tmp_path, made):
+    folder, output = files[0], tmp_path / "o.h5"
+    settings = {"reference": folder / "still.h5", "method": "pinv"}
+    whole = demux(folder, output, **settings)
+    every = list(made)
+    interrupted(lambda: demux(folder, output, **settings), len(every) - 5)
+    there = kept(output)
+    done = [name for name in every if name in there]
+    assert len(done) > 13 and len({name.split(".")[0] for name in done}) == 2
+    made.clear()
+    assert demux(folder, output, **settings) == whole
+    assert made == [name for name in every if name not in done]
+
+
+@pytest.mark.parametrize("files", ["own"], indirect=True)
+def test_kill_9_loses_no_more_than_the_tile_under_way(files, tmp_path, made):
+    folder, output = files[0], tmp_path / "o.h5"
+    whole = demux(folder, output)
+    every = list(made)
+    output.unlink()
+    patched = {f"plenocli.inverse.spectra.factored:{name}": value for name, value in TILES.items()}
+    words = ["demux", folder / "moved.h5", "--calibration", folder / "c.h5", "-o", output]
+    killed(words, 12, patched)
+    there = kept(output)
+    assert len(there) == 12 and not output.exists()
+    made.clear()
+    assert demux(folder, output) == whole
+    assert made == [name for name in every if name not in there] and len(made) < len(every) - 8
+
+
+@pytest.mark.parametrize("files", ["own"], indirect=True)
+def test_a_small_capture_keeps_nothing_and_clears_what_is_left(files, tmp_path, made, monkeypatch):
+    interrupted(lambda: demux(files[0], tmp_path / "o.h5"), 5)
+    assert kept(tmp_path / "o.h5")
+    monkeypatch.undo()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("plenocli.files.bench.Bench.put", lambda *_: pytest.fail("it was kept"))
+        demux(files[0], tmp_path / "o.h5")
+    assert [file.name for file in tmp_path.iterdir()] == ["o.h5"]

@@ -10,6 +10,7 @@ import time
 import numpy as np
 import pytest
 
+from plenocli.base.budget import Budget, within
 from plenocli.base.errors import NumericsError
 from plenocli.cli.main import run
 from plenocli.evaluation.metrics.quality import psnr
@@ -17,6 +18,8 @@ from plenocli.files.artefacts.reading import Stored, read_artefact
 from plenocli.files.read import captures
 from plenocli.inverse.picture import tiles
 from plenocli.stages.inverse.reconstruct import in_tiles
+from plenocli.stages.inverse.reconstruct import run as stage
+from plenocli.stages.inverse.reconstruct.recipe import Settings, recipe_of
 from tests.stages import test_reconstruct
 from tests.stages.test_reconstruct import N, make_files
 
@@ -98,14 +101,43 @@ def test_tiles_give_the_picture_of_the_whole(folder, tmp_path, monkeypatch, name
     assert sorted(p.name for p in tmp_path.iterdir()) == ["tiled.h5", "whole.h5"]
 
 
-def test_results_do_not_depend_on_workers(folder, tmp_path, small_tiles):
+@pytest.mark.parametrize(
+    ("kind", "method"), [("coupled", "lmmse"), ("alone", "lmmse"), ("alone", "tv")]
+)
+def test_results_do_not_depend_on_workers(folder, tmp_path, small_tiles, kind, method):
+    # threads of lmmse, processes of tv
     made, _ = folder
     for workers in ("1", "2"):
         found = picture(
-            made / "coupled", tmp_path / f"{workers}.h5", "--workers", workers, method="lmmse"
+            made / kind, tmp_path / f"{workers}.h5", "--workers", workers, method=method
         )
         assert found.data["image/value"].shape == (COUNT * N, COUNT * N)
     assert (tmp_path / "1.h5").read_bytes() == (tmp_path / "2.h5").read_bytes()
+
+
+def test_threads_are_as_many_as_the_memory_holds(folder, monkeypatch, tmp_path, small_tiles):
+    made, _ = folder
+    recipe = recipe_of(
+        Settings(method="lmmse", workers=4), made / "coupled/pif.h5", None, True, elsewhere=False
+    )
+    found = []
+    for kibibytes in np.geomspace(1 << 8, 1 << 17, 60):
+        with within(Budget(int(kibibytes * 1024))):
+            found.append(in_tiles.tiles_at_once(recipe))
+    assert found == sorted(found) and set(found) == {1, 2, 3, 4}
+    running, most, solve = [], [], in_tiles._TileTask.__call__
+
+    def watched(self, job):
+        running.append(job[0])
+        most.append(len(running))
+        done = solve(self, job)
+        running.remove(job[0])
+        return done
+
+    monkeypatch.setattr(in_tiles._TileTask, "__call__", watched)
+    monkeypatch.setattr(stage, "tiles_at_once", lambda recipe: 2)
+    picture(made / "coupled", tmp_path / "two.h5", "--workers", "4", method="lmmse")
+    assert max(most) == 2
 
 
 def test_a_run_that_ended_goes_on_from_its_tiles(folder, tmp_path, small_tiles, monkeypatch):

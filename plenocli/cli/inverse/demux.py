@@ -90,7 +90,8 @@ def command(
 
     OUT is a spectral EXR or an .h5 file; with several captures a folder with one file each. CAPTURE
     may be a folder: the captures in it. Finished ones are skipped on a rerun, a bad one is reported
-    and does not stop the others. Lenslets partly off the sensor are NaN.
+    and does not stop the others; where there is one, and it is large, a run that was killed goes on
+    from its tiles. Lenslets partly off the sensor are NaN.
 
     A lenslet's light reaches its neighbours' superpixels, which is wrong by one part in a hundred
     where neighbours differ. Where the camera's description is known (calibrate --camera keeps it,

@@ -133,7 +133,8 @@ def command(
 
     OUT is an .h5 file, an OME-TIFF (.tif) that ImageJ and Fiji open as stacks with their sizes, or
     an .exr with the picture in focus, depth as Z and every plane as a layer; with several captures,
-    or folders of them, a folder with one file each, in which finished ones are skipped.
+    or folders of them, a folder with one file each, in which finished ones are skipped. Of a large
+    capture a run that was killed goes on from the planes that it finished.
 
     Of a colour filter array each colour is refocused from its own pixels. Spectra from demux are
     refocused too, with the calibration of demux: each band is a view through its filter.

@@ -10,8 +10,13 @@ from typing import Any
 import h5py
 import numpy as np
 
+from plenocli.base.budget import spread
+from plenocli.base.tiling import bands
+
 FILTERS = {"shuffle": True, "compression": "gzip", "compression_opts": 1, "fletcher32": True}
 """As h5py's create_dataset takes them, in the order in which they are applied."""
+AT_ONCE = 8
+"""Chunks that wait, packed, to be written."""
 _BLOCK = 1 << 20
 """Words whose weighted sum stays below 2 to the 64."""
 
@@ -25,16 +30,21 @@ def write_chunks(dataset: h5py.Dataset, corner: tuple[int, ...], values: np.ndar
     """
     from isal import isal_zlib
 
-    sides = dataset.chunks
-    starts = itertools.product(*(range(0, n, side) for n, side in zip(values.shape, sides)))
-    for start in starts:
+    sides, packed = dataset.chunks, {}
+
+    def pack(*start: int) -> None:
         part = values[tuple(slice(at, at + side) for at, side in zip(start, sides))]
         if part.shape != sides:
             part = np.pad(part, [(0, side - n) for n, side in zip(part.shape, sides)])
-        packed = isal_zlib.compress(_shuffled(part), 1)
-        packed += fletcher32(packed).to_bytes(4, "little")
-        at = tuple(first + further for first, further in zip(corner, start))
-        dataset.id.write_direct_chunk(at, packed)
+        content = isal_zlib.compress(_shuffled(part), 1)
+        packed[start] = content + fletcher32(content).to_bytes(4, "little")
+
+    starts = list(itertools.product(*(range(0, n, k) for n, k in zip(values.shape, sides))))
+    for some in bands(len(starts), AT_ONCE):
+        spread(starts[some], pack)
+        for start in starts[some]:
+            at = tuple(first + further for first, further in zip(corner, start))
+            dataset.id.write_direct_chunk(at, packed.pop(start))
 
 
 def _shuffled(values: np.ndarray) -> Any:

@@ -18,7 +18,7 @@ from plenocli import __version__
 from plenocli.base.text import utf8
 from plenocli.base.tiling import InParts
 from plenocli.files.artefacts import schema as tables
-from plenocli.files.artefacts.chunks import FILTERS, write_chunks
+from plenocli.files.artefacts.chunks import AT_ONCE, FILTERS, write_chunks
 from plenocli.files.artefacts.container import HEADER_BYTES, MAGIC, READ_BYTES, Artefact, is_raw
 from plenocli.files.artefacts.kinds import SCHEMAS
 from plenocli.files.artefacts.sparse import SparseFile
@@ -266,7 +266,7 @@ def _write_parts(file, schema, path, values):
         waiting = sum(map(len, held))
         end = at + waiting
         ready = waiting if end % rows == 0 else end % rows // step * step - at % rows
-        if ready > 0:
+        if ready >= AT_ONCE * step or (ready > 0 and end % rows == 0):
             block = held[0] if len(held) == 1 else np.concatenate(held)
             put(block[:ready])
             at, held = at + ready, [block[ready:]] if ready < waiting else []

@@ -10,6 +10,7 @@ from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
+from threading import Lock
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -144,18 +145,22 @@ class _Windows:
     def __init__(self, capture: StoredCapture) -> None:
         self.capture = capture
         self._rows: tuple[slice, np.ndarray] | None = None
+        # threads read in turn: those that work meanwhile need no decoder of their own
+        self._turn = Lock()
 
     def read(self, rows: slice, columns: slice) -> Capture:
         """That of some pixels. Raises InputError."""
         size = (rows.stop - rows.start) * self.capture.shape[1] * self.capture.itemsize
-        if size > KEPT_SHARE * budget().memory:
-            return self.capture.window(rows, columns)
-        if self._rows is None or self._rows[0] != rows:
-            self._rows = None  # not two at a time
-            values = self.capture.values(rows).view()
-            values.flags.writeable = False
-            self._rows = rows, values
-        return self.capture.holding(self._rows[1][:, columns], rows, columns)
+        with self._turn:
+            if size > KEPT_SHARE * budget().memory:
+                return self.capture.window(rows, columns)
+            if self._rows is None or self._rows[0] != rows:
+                self._rows = None  # not two at a time
+                values = self.capture.values(rows).view()
+                values.flags.writeable = False
+                self._rows = rows, values
+            values = self._rows[1]
+        return self.capture.holding(values[:, columns], rows, columns)
 
 
 class _Stored:
@@ -178,9 +183,9 @@ class _Stored:
         )
         part = self.windows.read(*pixels)
         # what there is to say of all of it is said once
-        with collected_notes() if self._said else nullcontext():
+        said, self._said = self._said, True
+        with collected_notes() if said else nullcontext():
             found = superpixels(part, self.system)
-        self._said = True
         return replace(found, own=own)
 
 
@@ -204,13 +209,15 @@ def superpixel_source(
     """
     if calibration is None:
         path = Path(path)
-        windows = _windows(path, beside) if verify else _known(path, beside, _stamp(path))
+        windows = _opened(path, beside, anew=verify)
         if _divides(system.pixel_shape, windows.capture):
             yield _Stored(windows, system)
             return
     elif not each_pixel:
         files = Path(path), Path(calibration)
-        yield _along_the_grid(*files, _Same(system), beside, tuple(map(_stamp, files)))
+        with _turn:
+            source = _along_the_grid(*files, _Same(system), beside, tuple(map(_stamp, files)))
+        yield source
         return
     yield _Held(read_superpixels(path, system, calibration, each_pixel=each_pixel))
 
@@ -253,16 +260,24 @@ def _along_the_grid(
     return AlongTheGrid(capture, system.matrix, known, calibration, kept)
 
 
-def _windows(path: Path, beside: Path | None, *, verify: bool = True) -> _Windows:
-    """Those of a capture."""
-    with stored_capture(path, room=room_beside(beside), verify=verify) as stored:
-        return _Windows(stored)
+_turn = Lock()
+"""Threads open captures in turn, so that the second finds what the first has made."""
+_open: list[tuple[Any, _Windows]] = []
+"""The capture that was opened last, and what it goes by."""
 
 
-@lru_cache(maxsize=1)
-def _known(path: Path, beside: Path | None, stamp: tuple[int, int]) -> _Windows:
-    """The same of a file that this run has verified."""
-    return _windows(path, beside, verify=False)
+def _opened(path: Path, beside: Path | None, *, anew: bool) -> _Windows:
+    """Windows of a capture, as they were opened before where nothing has changed.
+
+    anew: opened and verified in any case.
+    """
+    with _turn:
+        key = path, beside, _stamp(path)
+        if anew or not _open or _open[0][0] != key:
+            _open.clear()
+            with stored_capture(path, room=room_beside(beside), verify=anew) as stored:
+                _open.append((key, _Windows(stored)))
+        return _open[0][1]
 
 
 def _stamp(path: str | Path) -> tuple[int, int]:

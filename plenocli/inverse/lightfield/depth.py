@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from plenocli.base.budget import budget
-from plenocli.base.tiling import around, bands, shared
+from plenocli.base.tiling import FORGETFUL, Keeper, around, bands, kept, shared
 from plenocli.inverse.lightfield.planes import DepthMap
 from plenocli.inverse.lightfield.refocus import STEP, Parts, displacement, pictures, place
 from plenocli.inverse.lightfield.samples import AT_ONCE, SampleBands
@@ -42,12 +43,18 @@ more often pixels are read; pictures are the same.
 """
 
 
-def depth(source: SampleBands, slopes: Sequence[float], width: float = 1.5) -> DepthMap:
+def depth(
+    source: SampleBands,
+    slopes: Sequence[float],
+    width: float = 1.5,
+    keeper: Keeper = FORGETFUL,
+) -> DepthMap:
     """The slope at which the views agree best, with its confidence, one value a pitch.
 
     source: samples of one capture.
     slopes: at least three, rising.
     width: of the Gaussian over which disagreement is averaged, pitches.
+    keeper: of the planes, and of the corrections, of this source.
 
     Disagreement is the variance of what meets a point beyond that of the picture's own slant within
     a lenslet's width; its least value is found on a parabola, and corrected by least squares. A
@@ -60,24 +67,27 @@ def depth(source: SampleBands, slopes: Sequence[float], width: float = 1.5) -> D
     docs/model.md, "Refocusing and depth".
     """
     tried = np.asarray(slopes, float)
-    return _map(source, tried, _disagreements(source, tried, width), width)
+    return _map(source, tried, _disagreements(source, tried, width, keeper), width, keeper)
 
 
 def depth_in_reach(
-    source: SampleBands, slopes: Sequence[float], width: float = 1.5
+    source: SampleBands,
+    slopes: Sequence[float],
+    width: float = 1.5,
+    keeper: Keeper = FORGETFUL,
 ) -> tuple[DepthMap, np.ndarray]:
     """`depth` over a range that grows, at the spacing of `slopes`, on the side on which lenslets
     with texture lie beyond it; at most to where neighbouring pixels of a superpixel see the scene a
     pitch apart, a slope of as many as a pitch has pixels, and to MOST.
 
-    source, width: as in `depth`.
+    source, width, keeper: as in `depth`.
     slopes: (plane,) at least three, rising, evenly spaced.
 
     Returns the map and the slopes (plane,) that were tried.
     """
     tried = np.asarray(slopes, float)
     gap = tried[1] - tried[0]
-    disagreement = _disagreements(source, tried, width)
+    disagreement = _disagreements(source, tried, width, keeper)
     for side in (-1, 1):
         while _beyond(disagreement, side) > FEW:
             end = tried[0 if side < 0 else -1]
@@ -85,10 +95,10 @@ def depth_in_reach(
             more = np.sort(more[np.abs(more) <= min(source.pitch, MOST)])
             if more.size == 0:
                 break
-            parts = [_disagreements(source, more, width), disagreement]
+            parts = [_disagreements(source, more, width, keeper), disagreement]
             disagreement = np.concatenate(parts[::-side])
             tried = np.concatenate([more, tried][::-side])
-    return _map(source, tried, disagreement, width), tried
+    return _map(source, tried, disagreement, width, keeper), tried
 
 
 def filled(slope: np.ndarray) -> np.ndarray | None:
@@ -104,14 +114,20 @@ def filled(slope: np.ndarray) -> np.ndarray | None:
     return slope[tuple(nearest)]
 
 
-def together(source: SampleBands, slopes: np.ndarray, step: int, waiting: int = 0) -> list[slice]:
+def together(
+    source: SampleBands, slopes: np.ndarray, todo: Sequence[int], step: int, waiting: int = 0
+) -> list[list[int]]:
     """Which planes are worked on together.
 
     slopes: of all.
+    todo: numbers of the planes that are worked on.
     waiting: rows of pictures that are held until others come.
     """
+    if not todo:
+        return []
     reach = displacement(source, slopes, step)
-    return bands(len(slopes), together_bytes() // plane_bytes(source, reach, step, waiting))
+    most = together_bytes() // plane_bytes(source, reach, step, waiting)
+    return [list(todo[some]) for some in bands(len(todo), most)]
 
 
 def together_bytes() -> int:
@@ -132,7 +148,7 @@ def plane_bytes(source: SampleBands, reach: int, step: int, waiting: int = 0) ->
 
 
 def _map(
-    source: SampleBands, tried: np.ndarray, disagreement: np.ndarray, width: float
+    source: SampleBands, tried: np.ndarray, disagreement: np.ndarray, width: float, keeper: Keeper
 ) -> DepthMap:
     """The map of the least disagreement (plane, row, column)."""
 
@@ -142,8 +158,10 @@ def _map(
         return least, textured, textured & _at_edge(part)
 
     found, textured, beyond = _by_rows(first, disagreement)
-    for _ in range(ROUNDS):
-        found = np.clip(found + _correction(source, found, width), tried[0], tried[-1])
+    for number in range(ROUNDS):
+        correct = partial(_correction, source, found, width)
+        (step,) = kept(keeper, f"correction {number}", lambda: [correct()])
+        found = np.clip(found + step, tried[0], tried[-1])
     inside = (found > tried[0]) & (found < tried[-1])
     confidence, sigma = _by_rows(
         lambda part, slope: _certainty(part, tried, slope), disagreement, found
@@ -240,16 +258,32 @@ def _edges(slope: np.ndarray, sigma: np.ndarray) -> np.ndarray:
     return known & (top - bottom >= 1)
 
 
-def _disagreements(source: SampleBands, slopes: np.ndarray, width: float) -> np.ndarray:
+def _disagreements(
+    source: SampleBands, slopes: np.ndarray, width: float, keeper: Keeper
+) -> np.ndarray:
     """(plane, row, column) float32, NaN where nothing meets a point."""
-    found = np.empty((len(slopes), *source.shape), np.float32)
+    found, todo = np.empty((len(slopes), *source.shape), np.float32), []
+    names = [plane_name("disagreement", slope) for slope in slopes]
+    for number, name in enumerate(names):
+        before = keeper.get(name)
+        if before is None:
+            todo.append(number)
+        else:
+            found[number] = before[0]
     waiting = 2 * (_coarse(source, width)[0].stop + int(8 * width))
-    for some in together(source, slopes, 2, waiting):
-        streams = shared(source, some.stop - some.start)
-        planes = [_disagreement(*both, source, width) for both in zip(streams, slopes[some])]
+    for numbers in together(source, slopes, todo, 2, waiting):
+        streams = shared(source, len(numbers))
+        planes = [_disagreement(*both, source, width) for both in zip(streams, slopes[numbers])]
         for rows, parts in zip(_coarse(source, width), zip(*planes)):
-            found[some, rows] = parts
+            found[numbers, rows] = parts
+        for number in numbers:
+            keeper.put(names[number], [found[number]])
     return found
+
+
+def plane_name(what: str, slope: float) -> str:
+    """Of what a Keeper keeps of the plane of a slope."""
+    return f"{what} {float(slope)!r}"
 
 
 def _coarse(source: SampleBands, width: float) -> list[slice]:

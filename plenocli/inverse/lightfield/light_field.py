@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
@@ -10,12 +11,13 @@ from typing import Any
 import numpy as np
 
 from plenocli.base.budget import budget
-from plenocli.base.tiling import around, shared
+from plenocli.base.tiling import BAND, EVERYTHING, FORGETFUL, Keeper, around, bands, shared
 from plenocli.inverse.lightfield.depth import (
     depth,
     depth_in_reach,
     filled,
     plane_bytes,
+    plane_name,
     together,
     together_bytes,
 )
@@ -57,6 +59,7 @@ def refocused(
     grow: bool = False,
     room: Room = in_memory,
     copies: int = 1,
+    keeper: Keeper = FORGETFUL,
 ) -> LightField:
     """Planes, depth map and views of the samples of a capture.
 
@@ -67,6 +70,8 @@ def refocused(
     room: what gives arrays for pictures by their shape; rows of their last two axes are put into
         them, one band after the other.
     copies: of all pictures that there are in memory at a time, in the end; for what is needed.
+    keeper: of what is finished, all but pictures; what it tells of these counts where `room` still
+        has them, from an earlier run.
 
     Raises NumericsError where memory does not suffice, InputError where no pixel is lit.
     docs/model.md, "Refocusing and depth".
@@ -74,13 +79,13 @@ def refocused(
     _require(source, slopes, views, copies, WIDER if grow else 1)
     found = None
     if len(slopes) >= 3 and grow:
-        found, slopes = depth_in_reach(source, slopes.tolist())
+        found, slopes = depth_in_reach(source, slopes.tolist(), keeper=keeper)
         _require(source, slopes, views, copies)
     elif len(slopes) >= 3:
-        found = depth(source, slopes.tolist())
+        found = depth(source, slopes.tolist(), keeper=keeper)
     if found is not None and optics is not None:
         found = in_metres(found, optics)
-    grey, coloured, sharpness = _planes(source, slopes, room)
+    grey, coloured, sharpness = _planes(source, slopes, room, keeper)
     own = None if found is None else filled(found.slope)
     sharp, tinted = (None, None) if own is None else _in_focus(source, own, room)
     seen, through = _views(source, views, room) if views else (None, None)
@@ -130,14 +135,22 @@ def _room(
     return grey, None if source.channels is None else room((*lead, source.count, *points))
 
 
-def _planes(source: SampleBands, slopes: np.ndarray, room: Room) -> tuple[Any, Any, np.ndarray]:
+def _planes(
+    source: SampleBands, slopes: np.ndarray, room: Room, keeper: Keeper
+) -> tuple[Any, Any, np.ndarray]:
     """(pictures, the same in colour or None, sharpness) of all planes."""
     grey, coloured = _room(source, room, STEP, (len(slopes),))
     square, count = np.zeros((2, len(slopes)))
-    for some in together(source, slopes, STEP):
-        numbers = range(some.start, some.stop)
+    names, todo = [plane_name("plane", slope) for slope in slopes], []
+    for number, name in enumerate(names):
+        before = keeper.get(name)
+        if before is None or before[0][2] != _checksum(grey, coloured, number):
+            todo.append(number)
+        else:
+            square[number], count[number] = before[0][:2]
+    for numbers in together(source, slopes, todo, STEP):
         streams = shared(source, len(numbers))
-        planes = [_plane(*both, source) for both in zip(streams, slopes[some])]
+        planes = [_plane(*both, source) for both in zip(streams, slopes[numbers])]
         for rows, parts in zip(source.points(STEP), zip(*planes)):
             for number, (mean, colours, steep) in zip(numbers, parts):
                 grey[number, rows] = mean
@@ -145,8 +158,22 @@ def _planes(source: SampleBands, slopes: np.ndarray, room: Room) -> tuple[Any, A
                     coloured[number, :, rows] = colours
                 square[number] += np.nansum(steep)
                 count[number] += np.count_nonzero(np.isfinite(steep))
+        for number in numbers:
+            told = square[number], count[number], _checksum(grey, coloured, number)
+            keeper.put(names[number], [np.array(told)])
     with np.errstate(invalid="ignore"):
         return grey, coloured, square / count
+
+
+def _checksum(grey: Any, coloured: Any, number: int) -> int:
+    """Of the pictures of a plane, as they are in their room."""
+    total = 0
+    for plane in (grey, coloured):
+        if plane is not None:
+            lead = number, *[EVERYTHING] * (len(plane.shape) - 3)
+            for rows in bands(plane.shape[-2], BAND // plane.shape[-1]):
+                total = zlib.crc32(np.ascontiguousarray(plane[(*lead, rows)]).data, total)
+    return total
 
 
 def _plane(

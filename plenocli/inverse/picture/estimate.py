@@ -176,31 +176,32 @@ def _cleaned(estimators: Estimators, piece: Superpixels) -> Cleaned:
     is believed only if LMMSE over 3x3 lenslets leaves less over without it, else only if the
     matrix is believed without it.
     """
-    tried: list[Cleaned] = []
+    tried: dict[bool, Cleaned] = {}
+
+    def cleaned(veil: bool) -> Cleaned:
+        if veil not in tried:
+            whole = None if piece.whole is None else piece.whole.on_trial()
+            tried[veil] = clean(estimators, replace(piece, whole=whole), veil=veil)
+        return tried[veil]
 
     def left(found: Cleaned) -> float:
-        return left_over(estimators, estimate_jointly(estimators, found.data))
+        alone = replace(found.data, whole=None)
+        return left_over(estimators, estimate_jointly(estimators, alone))
 
     def veil_believed() -> bool:
-        data = replace(piece, whole=None)
-        bare = clean(estimators, data)
-        tried.append(bare)
-        veiled = any(isinstance(f, VeilFound) and f.removed for f in bare.findings)
-        if not veiled:
+        bare = cleaned(True)
+        if not any(isinstance(f, VeilFound) and f.removed for f in bare.findings):
             return True
-        other = clean(estimators, data, veil=False)
         if estimators.coupled and estimators.overlap == 3:
-            believed = data.noise is not None and left(bare) < left(other)
-        else:
-            level = _noise(estimators, bare.data, bare.data.y)
-            believed = believe(estimators, bare.data.y, level, data.scene).right
-        if not believed:
-            tried.append(other)
-        return believed
+            return piece.noise is not None and left(bare) < left(cleaned(False))
+        level = _noise(estimators, bare.data, bare.data.y)
+        return believe(estimators, bare.data.y, level, piece.scene).right
 
-    believed = piece.common("veil believed", veil_believed)
-    # of a piece, what is common to all pieces is asked for again
-    return tried[-1] if piece.whole is None else clean(estimators, piece, veil=believed)
+    found = cleaned(piece.common("veil believed", veil_believed))
+    if piece.whole is not None and found.data.whole is not None:
+        piece.whole.take(found.data.whole)
+        found = replace(found, data=replace(found.data, whole=piece.whole))
+    return found
 
 
 def _noise(estimators: Estimators, data: Superpixels, own: np.ndarray) -> NoiseLevel:

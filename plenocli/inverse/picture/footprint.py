@@ -13,7 +13,7 @@ import numpy as np
 
 from plenocli.base.budget import budget
 from plenocli.inverse.picture.estimators import Estimators
-from plenocli.inverse.picture.lenslet_model import LensletMatrix, Superpixels
+from plenocli.inverse.picture.lenslet_model import LensletMatrix
 from plenocli.inverse.picture.nuisances.pixel_model import CHUNK
 from plenocli.inverse.picture.solvers.joint_lmmse import MOST
 from plenocli.inverse.picture.solvers.lmmse import SCALES
@@ -173,7 +173,8 @@ def reconstruction(n: Sizes, phases: Phases, *, joint: bool = False) -> float:
 
 def require_reconstruction(
     estimators: Estimators,
-    data: Superpixels,
+    lenslets: int,
+    sigma: float | None,
     where: Path,
     phases: Phases,
     *,
@@ -181,8 +182,9 @@ def require_reconstruction(
 ) -> None:
     """Refuse, before anything is worked out, what does not fit the memory of this process.
 
-    data: the capture.
-    where: its path, for the message.
+    lenslets: that are looked at together.
+    sigma: noise of a pixel, None where it is not known.
+    where: path of the capture, for the message.
     phases, joint: as in `reconstruction`.
 
     Raises NumericsError.
@@ -190,11 +192,11 @@ def require_reconstruction(
     system = estimators.system
     most = min(MOST, *system.own.shape)
     atoms = 0 if estimators.read_dictionary is None else estimators.learnt.atoms.shape[1]
-    sizes = Sizes.of(system, data.y.shape[0] * data.y.shape[1], most, atoms)
+    sizes = Sizes.of(system, lenslets, most, atoms)
     needed = reconstruction(sizes, phases, joint=joint)
     # what stands above the noise decides, and may be much less
     if needed > budget().memory > 3 * NUMBER * system.own.size:
-        seen = _directions(system.own, estimators.options.noise_sigma or data.sigma or 0.0)
+        seen = _directions(system.own, estimators.options.noise_sigma or sigma or 0.0)
         sizes = replace(sizes, directions=min(most, seen))
         needed = reconstruction(sizes, phases, joint=joint)
     budget().require(
@@ -203,6 +205,25 @@ def require_reconstruction(
         where,
         "take fewer lenslets or points, or another --method",
     )
+
+
+def pieces_at_once(
+    estimators: Estimators, lenslets: int, phases: Phases, *, joint: bool, most: int
+) -> int:
+    """How many pieces of `lenslets`, `most` at most, the memory holds, in as many threads of this
+    process; one where there is no room for more.
+
+    phases, joint: as in `reconstruction`.
+    """
+    system = estimators.system
+    # threads share all that does not go with lenslets
+    sizes = Sizes.of(system, lenslets, min(MOST, *system.own.shape), 0)
+    for count in range(most, 1, -1):
+        # what another one made waits to be kept while it is at the next
+        together = replace(sizes, lenslets=(2 * count - 1) * lenslets)
+        if reconstruction(together, phases, joint=joint) <= budget().memory:
+            return count
+    return 1
 
 
 def _directions(own: np.ndarray, sigma: float) -> int:

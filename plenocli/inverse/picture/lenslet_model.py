@@ -177,6 +177,15 @@ class Whole:
             self.found.setdefault(name, {})[which] = made
         return made
 
+    def on_trial(self) -> Whole:
+        """One that knows the same, and finds what this one need not `take`."""
+        found = {name: dict(of) for name, of in self.found.items()}
+        return self if self.closed else replace(self, found=found)
+
+    def take(self, trial: Whole) -> None:
+        """What a trial found."""
+        self.found.update(trial.found)
+
     def for_means(self) -> Whole:
         """For another piece, which finds its own."""
         known = {name: dict(of) for name, of in self.found.items() if name not in MEANS}

@@ -13,6 +13,7 @@ from typing import Protocol
 
 import numpy as np
 
+from plenocli.base.budget import spread
 from plenocli.base.tiling import bands
 from plenocli.inverse.picture.estimate import BRIGHTNESS
 from plenocli.inverse.picture.estimators import Estimators
@@ -104,6 +105,11 @@ def tiles_of(estimators: Estimators, method: Method, count: tuple[int, int]) -> 
     ]
 
 
+def largest_tile(estimators: Estimators, method: Method) -> int:
+    """Lenslets that are looked at for the largest tile that there may be."""
+    return (side_of(estimators.system) + 2 * _margin(estimators, method)) ** 2
+
+
 def _even(count: int, most: int) -> list[slice]:
     """`count` in parts of `most` at most, as long as each other."""
     return bands(count, -(-count // -(-count // most)))
@@ -125,16 +131,17 @@ def survey(system: LensletMatrix, source: Source, tile: int) -> tuple[Whole, Til
     on a side that is most like it).
     """
     count = source.count
-    levels, detail = np.zeros(count), np.zeros(count)
-    power, values = 0.0, 0
-    for rows in bands(count[0], max(1, tile**2 // count[1])):
+    levels, detail, power = np.zeros(count), np.zeros(count), np.zeros(count)
+
+    def look(rows: slice) -> None:
         y = source.cut(rows, slice(0, count[1])).y
         y = np.where(np.isfinite(y), y, 0)
         found = system.levels(y)
-        power, values = power + float(np.sum(found**2)), values + found.size
-        levels[rows] = found.mean(axis=2)
+        levels[rows], power[rows] = found.mean(axis=2), np.mean(found**2, axis=2)
         detail[rows] = np.sqrt(np.mean((y - found @ system.even.T) ** 2, axis=2))
-    unit = math.sqrt(power / values) / BRIGHTNESS
+
+    spread([(rows,) for rows in bands(count[0], max(1, tile**2 // count[1]))], look)
+    unit = math.sqrt(float(power.mean())) / BRIGHTNESS
     return Whole({"unit": {None: unit if unit > 0 else 1.0}}), _typical(levels, detail, tile)
 
 
@@ -145,12 +152,12 @@ def _typical(levels: np.ndarray, detail: np.ndarray, side: int) -> Tile:
     """
     rows, columns = (min(side, n) for n in levels.shape)
     of_all = [np.quantile(one, LIKE) for one in (levels, detail)]
-    spread = [max(float(np.ptp(one)), np.finfo(float).tiny) for one in of_all]
+    widths = [max(float(np.ptp(one)), np.finfo(float).tiny) for one in of_all]
 
     def unlike(area: Area) -> float:
         return sum(
             float(np.mean(np.abs(np.quantile(one[area], LIKE) - known))) / wide
-            for one, known, wide in zip((levels, detail), of_all, spread)
+            for one, known, wide in zip((levels, detail), of_all, widths)
         )
 
     areas = [

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,6 +14,7 @@ import numpy as np
 from plenocli.base.budget import budget
 from plenocli.base.errors import ConfigError, NumericsError, UsageError
 from plenocli.base.progress import note
+from plenocli.base.tiling import FORGETFUL, Keeper, kept
 from plenocli.inverse.registration.alignment import align, believed, doubtful, misfit_told
 from plenocli.inverse.spectra.bands import by_filter, by_state
 from plenocli.inverse.spectra.crosstalk import METHODS as NEIGHBOURLY
@@ -75,6 +77,7 @@ class Demultiplexer:
         known: LabelledSpectra | None = None,
         threads: int = 1,
         several: bool = True,
+        keeper: Keeper = FORGETFUL,
     ) -> None:
         """Factor a calibration.
 
@@ -88,6 +91,7 @@ class Demultiplexer:
         known: spectra whose mean and covariance are the prior's; None: those of many surfaces.
         threads: for factoring the response.
         several: whether many captures follow; for one, less is kept in memory.
+        keeper: of what follows from the calibration and takes long.
 
         Raises UsageError where a method needs a camera that there is none of, ConfigError for one
             that tells no neighbours' light.
@@ -99,7 +103,9 @@ class Demultiplexer:
         self.neighbours = self._neighbours(calibration, camera)
         self.moving = _moving(calibration, self.neighbours)
         self._displaced: dict[tuple[float, ...], NeighbourLight] = {}
-        self.prior = light_prior(LensletResponses.of(calibration), known)
+        prior = partial(light_prior, LensletResponses.of(calibration), known)
+        found = kept(keeper, "prior", lambda: prior() or ())
+        self.prior = (found[0], found[1]) if found else None
         # its superpixels, one for every lenslet, have served
         calibration = replace(calibration, white=None)
         self.responses = LensletResponses.of(calibration, threads, several).prepare()
@@ -130,11 +136,18 @@ class Demultiplexer:
             note(f"warning: {error}: lenslets are demultiplexed one by one")
             return None
 
-    def estimate(self, capture: Capture, path: Name, method: str | None = None) -> Spectra:
+    def estimate(
+        self,
+        capture: Capture,
+        path: Name,
+        method: str | None = None,
+        keeper: Keeper = FORGETFUL,
+    ) -> Spectra:
         """Radiances of one capture, registered to the calibration.
 
         path: of the capture, for messages.
         method: instead of the usual one.
+        keeper: of tiles of this capture, where lenslets are on their own.
 
         Returns Spectra whose bands may come in two states (plenocli.inverse.spectra.bands).
         Raises InputError where capture and calibration do not go together, NumericsError where no
@@ -144,7 +157,7 @@ class Demultiplexer:
         signal, noise = readout(capture, self.responses, path)
         require_noise(noise, method)
         if self.neighbours is None or noise is None or method not in (*NEIGHBOURLY, "auto"):
-            found = self._alone(signal, noise, method, path)
+            found = self._alone(partial(self._aligned, signal, noise, method, path, keeper))
         else:
             found = self._together(self.neighbours, signal, noise, method, path)
         if not np.isfinite(found.value).any():
@@ -154,12 +167,12 @@ class Demultiplexer:
         warning = misfit_told(found.residual, found.trace.registration)
         return replace(found, trace=replace(found.trace, warning=warning))
 
-    def _alone(self, signal: Readout, noise: Noise | None, method: str, path: Name) -> Spectra:
-        """Lenslet by lenslet."""
-        found = self._aligned(signal, noise, method, path, self.register)
+    def _alone(self, aligned: Callable[..., Spectra]) -> Spectra:
+        """Lenslet by lenslet; aligned: _aligned of one capture."""
+        found = aligned(self.register)
         tried = found.trace.registration
         if tried and self.register == "auto" and doubtful(found.residual, tried):
-            return self._believed(found, tried, signal, noise, method, path)
+            return self._believed(found, tried, aligned)
         return found
 
     def _together(
@@ -257,22 +270,17 @@ class Demultiplexer:
         self,
         found: Spectra,
         registration: Registration,
-        signal: Readout,
-        noise: Noise | None,
-        method: str,
-        path: Name,
+        aligned: Callable[..., Spectra],
     ) -> Spectra:
         """`found`, or the estimate with motion alone corrected, or with nothing: the first that
         explains its residuals.
         """
-        uncorrected = self._aligned(signal, noise, method, path, "off")
+        uncorrected = aligned("off")
         if believed(found.residual, uncorrected.residual):
             return found
         if "motion" in registration.corrected:
             moved = (
-                found
-                if registration.corrected == ("motion",)
-                else self._aligned(signal, noise, method, path, "auto", levels=False)
+                found if registration.corrected == ("motion",) else aligned("auto", levels=False)
             )
             if believed(moved.residual, uncorrected.residual):
                 return moved
@@ -285,6 +293,7 @@ class Demultiplexer:
         noise: Noise | None,
         method: str,
         path: Name,
+        keeper: Keeper,
         mode: str,
         levels: bool = True,
     ) -> Spectra:
@@ -299,6 +308,7 @@ class Demultiplexer:
             self.prior,
             self.ratio,
             aligned.stray,
+            keeper.under(mode if levels else f"{mode} but levels"),
         )
         return replace(found, trace=replace(found.trace, registration=aligned.registration))
 

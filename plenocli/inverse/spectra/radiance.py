@@ -5,15 +5,16 @@ method asked for or the best one.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from plenocli.base.errors import InputError, NumericsError
-from plenocli.base.tiling import bands
+from plenocli.base.tiling import FORGETFUL, Keeper, bands, kept
 from plenocli.forward.sensor.noise import Noise
 from plenocli.inverse.spectra.bands import with_polarisation
 from plenocli.inverse.spectra.demultiplex import demultiplex, noise_variance
@@ -150,6 +151,7 @@ def estimate(
     prior: Prior | None = None,
     ratio: bool = False,
     stray: np.ndarray | None = None,
+    keeper: Keeper = FORGETFUL,
 ) -> Spectra:
     """The radiances of a capture.
 
@@ -164,6 +166,7 @@ def estimate(
         F divides out (to first order, and but for crosstalk) and does not count.
     stray: (4, pixel, n), by the parity of the window's first pixel: patterns of light that is no
         band's, unknowns of their own for all methods but single pixel.
+    keeper: of what is finished, of this capture by this method alone.
 
     Returns Spectra, of the quantity radiance.
     Raises NumericsError where the method needs the noise or a prior that there is none of, or no
@@ -176,7 +179,15 @@ def estimate(
             fix="use wls or pinv",
         )
     widened, prior = _with_stray(c, stray, prior, values)
-    job = _Estimation(c=c, widened=widened, prior=prior, values=values, noise=noise, ratio=ratio)
+    job = _Estimation(
+        c=c,
+        widened=widened,
+        prior=prior,
+        values=values,
+        noise=noise,
+        ratio=ratio,
+        keeper=keeper,
+    )
     if noise is None and method in ("wls", "lmmse"):
         raise NumericsError(
             f"{method} weighs pixels by their noise, which is not known",
@@ -237,7 +248,7 @@ class _Estimation:
 
     c: the responses as they are.
     widened: with stray light as further bands; prior likewise.
-    values, noise, ratio: as estimate's.
+    values, noise, ratio, keeper: as estimate's.
     """
 
     def __init__(
@@ -249,9 +260,10 @@ class _Estimation:
         values: Readout | np.ndarray,
         noise: Noise | None,
         ratio: bool,
+        keeper: Keeper,
     ) -> None:
         self.c, self.widened, self.prior, self.noise, self.ratio = c, widened, prior, noise, ratio
-        self.values = values
+        self.values, self.keeper = values, keeper
         self.bands, self.unknowns = len(c.wavelengths), widened.response.shape[-1]
 
     def cut(self, which: np.ndarray | slice) -> np.ndarray:
@@ -274,23 +286,31 @@ class _Estimation:
         value, sigma = (np.full((*shape, self.bands), np.nan) for _ in range(2))
         residual = np.full(shape, np.nan, np.float32)
         for part in bands(len(self.c.sites[0]), tile_of(self.widened.response)):
-            tile = _Lenslets(self, part, self.widened.some(part))
-            sums = tile.equations() if self.noise is None else tile.weighted(method == "pinv")
-            found = (
-                tile.single_pixel(sums) if method == "single-pixel" else tile.solved(sums, method)
-            )
             places = tuple(site[part] for site in self.c.sites)
-            value[places], sigma[places] = (one[:, : self.bands] for one in found)
-            residual[places] = tile.residual(sums)
+            value[places], sigma[places], residual[places] = kept(
+                self.keeper, f"{part.start}-{part.stop}", partial(self._answer, part, method)
+            )
         return value, sigma, residual
+
+    def _answer(self, part: slice, method: str) -> tuple[np.ndarray, ...]:
+        """`answers` of some lenslets, (lenslet, band) and (lenslet,)."""
+        tile = _Lenslets(self, part, self.widened.some(part))
+        sums = tile.equations() if self.noise is None else tile.weighted(method == "pinv")
+        found = tile.single_pixel(sums) if method == "single-pixel" else tile.solved(sums, method)
+        value, sigma = (one[:, : self.bands] for one in found)
+        return value, sigma, tile.residual(sums)
 
     @cached_property
     def starved(self) -> bool:
         """Whether noise leaves less than ten levels of the prior's spread: then weights from
         least squares follow the noise.
         """
-        if self.prior is None:
+        prior = self.prior
+        if prior is None:
             return False
+        return bool(kept(self.keeper, "starved", lambda: [np.array(self._starved(prior))])[0])
+
+    def _starved(self, prior: Prior) -> bool:
         few = slice(None, None, max(1, len(self.c.sample) // 64))
         lenslets = _Lenslets(self, self.c.sample[few], self.widened.sampled.some(few))
         sums = lenslets.equations(
@@ -303,17 +323,25 @@ class _Estimation:
         return not len(sigma) or bool(
             (
                 np.median(sigma[:, : self.bands], axis=0)
-                > 0.1 * np.sqrt(np.diag(self.prior[1])[: self.bands])
+                > 0.1 * np.sqrt(np.diag(prior[1])[: self.bands])
             ).any()
         )
 
     def best(self) -> tuple[str, str]:
         """(method, reason) with the least predicted error."""
+        names = "pinv", "wls", *(["lmmse"] if self.prior else []), "single-pixel"
+        (errors,) = kept(self.keeper, "errors", lambda: [np.array(self._errors(names[:-1]))])
+        error = dict(zip(names, errors.tolist()))
+        least = min(error.values())
+        used = next(m for m in error if error[m] <= WORTHWHILE * least)
+        return used, "predicted rms error of radiance " + ", ".join(
+            f"{m} {np.sqrt(e):.3g}" for m, e in error.items()
+        )
+
+    def _errors(self, names: Sequence[str]) -> list[float]:
+        """Predicted mean square errors of methods, and of single-pixel extraction."""
         sums = self.sample.weighted()
-        tried = {
-            m: self.sample.solved(sums, m)[1][:, : self.bands]
-            for m in ("pinv", "wls", *(["lmmse"] if self.prior else []))
-        }
+        tried = {m: self.sample.solved(sums, m)[1][:, : self.bands] for m in names}
         if not np.isfinite(tried["pinv"]).any():
             raise NumericsError(
                 "no lenslet could be demultiplexed",
@@ -322,13 +350,8 @@ class _Estimation:
                     "the calibration differ"
                 ),
             )
-        error = {m: float(np.nanmean(sigma**2)) for m, sigma in tried.items()}
-        error["single-pixel"] = self._single_pixel_error(self.sample.radiance(sums))
-        least = min(error.values())
-        used = next(m for m in error if error[m] <= WORTHWHILE * least)
-        return used, "predicted rms error of radiance " + ", ".join(
-            f"{m} {np.sqrt(e):.3g}" for m, e in error.items()
-        )
+        error = [float(np.nanmean(sigma**2)) for sigma in tried.values()]
+        return [*error, self._single_pixel_error(self.sample.radiance(sums))]
 
     def _single_pixel_error(self, radiance: np.ndarray) -> float:
         """Mean square error that single-pixel extraction would make on the sample: crosstalk

@@ -16,6 +16,7 @@ from plenocli.base.budget import one_thread
 from plenocli.base.errors import InputError, NumericsError
 from plenocli.base.progress import note
 from plenocli.base.text import Record
+from plenocli.base.tiling import FORGETFUL, Keeper
 from plenocli.execution.batch import outcomes, plan_batch, summarise
 from plenocli.execution.pool import absolute, open_pool
 from plenocli.files.images.mosaic import capture_in_file
@@ -26,10 +27,14 @@ from plenocli.inverse.spectra.demultiplexer import Demultiplexer, method_of_whit
 
 if TYPE_CHECKING:
     from plenocli.execution.batch import Batch, BatchSummary
+    from plenocli.files.bench import Bench
+    from plenocli.inverse.calibration.calibration import Calibration
     from plenocli.inverse.registration.alignment import Registration
     from plenocli.inverse.spectra.spectra import Spectra
 
 Name = str | Path
+FEW = 6
+"""Tiles of a capture up to which none is kept: some seconds of work."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -147,11 +152,10 @@ def run_demux(
             CaptureDemultiplexer(
                 calibration,
                 settings,
+                dict(batch.todo) if scheduler is None else {},
                 overwrite,
                 command,
                 threads=min(workers, len(batch.todo)),
-                several=len(batch.todo) > 1,
-                targets=dict(batch.todo),
             )
             if batch.todo
             else None
@@ -274,7 +278,7 @@ class Setup:
 
 @lru_cache(maxsize=1)
 def _demultiplexer(setup: Setup) -> CaptureDemultiplexer:
-    return CaptureDemultiplexer(setup.calibration, setup.settings, False, "")
+    return CaptureDemultiplexer(setup.calibration, setup.settings, {}, False, "")
 
 
 def demux_elsewhere(setup: Setup, capture: Name) -> tuple[Spectra, dict[str, Any]]:
@@ -291,23 +295,22 @@ class CaptureDemultiplexer:
 
     calibration: its file.
     settings: how captures are demultiplexed.
+    targets: results by the captures that follow, beside which one that cannot be read in parts is
+        decoded where it is large, and finished tiles of a single large one are kept, for a run
+        after one that was killed; empty: they are many, and not written here.
     overwrite: whether results replace files.
     command: for their provenance.
     threads: for factoring the response.
-    several: whether many captures follow.
-    targets: their results, beside which a capture that cannot be read in parts is decoded where it
-        is large; that of others is held.
     """
 
     def __init__(
         self,
         calibration: Name,
         settings: Settings,
+        targets: Mapping[Path, Path],
         overwrite: bool,
         command: str,
         threads: int = 1,
-        several: bool = True,
-        targets: Mapping[Path, Path] | None = None,
     ) -> None:
         from plenocli.files.artefacts.provenance import describe_inputs
         from plenocli.files.read.calibrations import read_described
@@ -316,11 +319,13 @@ class CaptureDemultiplexer:
         from plenocli.inverse.calibration.calibration import there
 
         self.settings, self.overwrite, self.command = settings, overwrite, command
-        self.targets = targets or {}
+        self.targets, several = targets, len(targets) != 1
         self.inputs = describe_inputs(_roles(calibration, settings))
         found, described = read_described(
             calibration, needs=("response", "windows", "white", "dark"), in_file=True
         )
+        self.bench = None if several else self._bench(*next(iter(targets.items())), found)
+        self.keeper: Keeper = self.bench or FORGETFUL
         self.solver = Demultiplexer(
             found,
             method=settings.method,
@@ -332,10 +337,24 @@ class CaptureDemultiplexer:
             else read_labelled(settings.prior, there(found.response).wavelengths),
             threads=threads,
             several=several or settings.reference is not None,
+            keeper=self.keeper,
         )
         self.reference: Spectra | None = None
         if settings.reference is not None:
             self.reference = self.demux(settings.reference, self._method_of_reference())[0]
+
+    def _bench(self, capture: Path, target: Path, calibration: Calibration) -> Bench | None:
+        """Where tiles are kept until the result is written; None where there are few."""
+        from plenocli.files.bench import Bench, clear
+        from plenocli.inverse.calibration.calibration import there
+        from plenocli.inverse.spectra.factored import tile_of
+
+        lenslets = int(calibration.grid.valid.sum())
+        if lenslets < FEW * tile_of(there(calibration.response).matrix):
+            clear(target)
+            return None
+        plain = replace(self.settings, reference=None, camera=None, prior=None)
+        return Bench.beside(target, (plain, self.inputs, describe_capture(capture)))
 
     def _method_of_reference(self) -> str:
         """The white reference is even, so that lenslets need not know of each other, and is
@@ -350,7 +369,8 @@ class CaptureDemultiplexer:
         """
         room = room_beside(self.targets.get(Path(path)))
         capture = capture_in_file(path, cfa=self.solver.responses.cfa, room=room)
-        found = self.solver.estimate(capture, path, method)
+        keeper = self.keeper.under("capture" if method is None else "reference")
+        found = self.solver.estimate(capture, path, method, keeper)
         if method is None:
             told = {str(path): found}
             if self.reference is not None:
@@ -382,6 +402,8 @@ class CaptureDemultiplexer:
             reference=self.settings.reference,
             overwrite=self.overwrite,
         )
+        if self.bench is not None:
+            self.bench.remove()
         return _capture_summary(found, capture, target)
 
 

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,12 +18,15 @@ from plenocli.execution.pool import open_pool
 
 if TYPE_CHECKING:
     from plenocli.execution.batch import BatchSummary
+    from plenocli.files.bench import Bench
     from plenocli.inverse.lightfield.optics import MicroscopeOptics, Optics
     from plenocli.inverse.lightfield.planes import DepthMap, LightField
     from plenocli.inverse.lightfield.samples import SampleBands
 
 COPIES = {".h5": 0, ".tif": 2, ".tiff": 2, ".exr": 7}
 """How often all pictures are in memory while a file of a suffix is written (measured)."""
+LARGE = 64
+"""Bands of samples, times planes, from which on what is finished is kept: some seconds of work."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,7 +121,7 @@ def run_refocus(
     tried = _slopes(settings, optics)
     targets = dict(batch.todo)
     work = partial(_refocused, targets=targets, settings=settings, optics=optics, tried=tried)
-    write = partial(_write, settings=settings, overwrite=overwrite, command=command)
+    write = partial(_write, overwrite=overwrite, command=command)
     with (
         one_thread(),
         open_pool(min(workers, len(batch.todo)), None, threads=True) as pool,
@@ -144,48 +147,79 @@ def _refocused(
     settings: Settings,
     optics: Optics | MicroscopeOptics | None,
     tried: np.ndarray,
-) -> tuple[LightField, SampleBands]:
-    """The light field of one capture, and what it was made from. What becomes an artefact is kept
-    beside it meanwhile.
+) -> _Refocused:
+    """The light field of one capture. What becomes an artefact is kept beside it meanwhile, and of
+    a large one all that is finished, for a run after one that was killed.
     """
+    from plenocli.base.tiling import FORGETFUL
+    from plenocli.files.artefacts.provenance import describe_inputs
     from plenocli.files.scratch import Scratch
     from plenocli.inverse.lightfield.light_field import in_memory, refocused
 
     target = targets[capture]
     source = _source(capture, settings.calibration, target)
-    return (
-        refocused(
-            source,
-            tried,
-            views=settings.views,
-            optics=optics,
-            grow=not (settings.slopes or settings.distances),
-            room=Scratch(target) if target.suffix == ".h5" else in_memory,
-            copies=COPIES[target.suffix],
-        ),
-        source,
+    inputs = describe_inputs(
+        {"capture": capture, "calibration": settings.calibration, "camera": settings.camera}
     )
+    bench = _bench(
+        target, source, tried, (replace(settings, calibration=None, camera=None), inputs)
+    )
+    in_file = bench is not None or target.suffix == ".h5"
+    field = refocused(
+        source,
+        tried,
+        views=settings.views,
+        optics=optics,
+        grow=not (settings.slopes or settings.distances),
+        room=Scratch(target, bench) if in_file else in_memory,
+        copies=COPIES[target.suffix],
+        keeper=bench or FORGETFUL,
+    )
+    if in_file and target.suffix != ".h5":
+        field = field.in_memory()
+    return _Refocused(field=field, source=source, inputs=inputs, bench=bench)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Refocused:
+    """A light field, what it was made from, and where what is finished of it is kept."""
+
+    field: LightField
+    source: SampleBands
+    inputs: dict[str, dict[str, str]]
+    bench: Bench | None
+
+
+def _bench(target: Path, source: SampleBands, tried: np.ndarray, depends: Any) -> Bench | None:
+    """Where what is finished is kept until the result is written; None of a small capture.
+
+    depends: all that it depends on, beside the code and how the capture is cut into bands.
+    """
+    from plenocli.files.bench import Bench, clear
+
+    if len(source.rows) * len(tried) < LARGE:
+        clear(target)
+        return None
+    return Bench.beside(target, (depends, source.rows))
 
 
 def _write(
-    done: tuple[LightField, SampleBands],
+    done: _Refocused,
     capture: Path,
     target: Path,
     *,
-    settings: Settings,
     overwrite: bool,
     command: str,
 ) -> RefocusSummary:
     """Write one light field."""
-    from plenocli.files.artefacts.provenance import Provenance, describe_inputs
+    from plenocli.files.artefacts.provenance import Provenance
     from plenocli.files.results.lightfields import write_lightfield
 
-    field, source = done
-    inputs = describe_inputs(
-        {"capture": capture, "calibration": settings.calibration, "camera": settings.camera}
-    )
-    provenance = Provenance(command=command, inputs=inputs, seed=0)
+    field, source = done.field, done.source
+    provenance = Provenance(command=command, inputs=done.inputs, seed=0)
     write_lightfield(target, field, source, provenance, overwrite=overwrite)
+    if done.bench is not None:
+        done.bench.remove()
     known, beyond = _told(field.depth, field.slopes)
     best = int(np.argmax(field.sharpness))
     distance = np.nan if field.distances is None else float(field.distances[best])

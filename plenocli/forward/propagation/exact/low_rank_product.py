@@ -12,12 +12,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from threading import local
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
+from plenocli.base.budget import spread
 from plenocli.base.device import CPU, Device, beside, namespace
 from plenocli.base.errors import NumericsError
+from plenocli.base.tiling import bands
 from plenocli.forward.propagation.complex_products import THREE_SERVE, product_of_thirds, thirds
 from plenocli.forward.propagation.fresnel.spread_function import terms_within
 
@@ -295,11 +298,18 @@ def _product(x: Any, y: Any) -> Any:
         return x @ y
     if not (np.iscomplexobj(x) and np.iscomplexobj(y)):
         return x @ y
-    out = np.empty((len(x), y.shape[1]), x.dtype)
-    parts, work = thirds(y), np.empty((3, min(ROWS, len(x)), y.shape[1]), x.real.dtype)
-    for start in range(0, len(x), ROWS):
-        part, target = x[start : start + ROWS], out[start : start + ROWS]
-        target.real, target.imag = product_of_thirds(thirds(part), parts, work[:, : len(part)])
+    out, parts = np.empty((len(x), y.shape[1]), x.dtype), thirds(y)
+    places = local()  # a thread's for its products
+
+    def work(rows: slice) -> None:
+        if not hasattr(places, "own"):
+            places.own = np.empty((3, min(ROWS, len(x)), y.shape[1]), x.real.dtype)
+        part, target = x[rows], out[rows]
+        target.real, target.imag = product_of_thirds(
+            thirds(part), parts, places.own[:, : len(part)]
+        )
+
+    spread([(rows,) for rows in bands(len(x), ROWS)], work)
     return out
 
 

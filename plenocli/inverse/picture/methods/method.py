@@ -109,6 +109,13 @@ class Method(ABC):
     points_around: int = 0
     unrestrained: bool = False
 
+    @property
+    def in_threads(self) -> bool:
+        """Whether threads share its tiles as well as processes, which start late and hold all that
+        tiles have in common once each: it does little but multiply matrices.
+        """
+        return self.sees is not Sees.PICTURE and not self.in_batches
+
     def makes_joint_estimate(self, estimators: Estimators) -> bool:
         """Whether LMMSE over 3x3 lenslets is made, before the method or instead of it."""
         if estimators.overlap != 3 or self.sees is Sees.LENSLET_AS_IS:

@@ -289,7 +289,7 @@ class _Task:
             misfit = self.common("misfit", partial(self._misfit, stacked), k)
             # with the noise that is left the estimate does not amplify it
             lmmse = replace(self.lmmse, sigma=self.model.sigma * max(1.0, misfit))
-            x = lmmse.apply(stacked, lmmse.scales(stacked, self.common))
+            x = lmmse.likely(stacked, self.common)
             own = own_light(self.estimators, y, x.T.reshape(*y.shape[:2], -1))
         return own
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
+from plenocli.base.budget import spread
 from plenocli.inverse.picture.lenslet_model import Common, alone
 from plenocli.inverse.picture.nuisances.pixel_model import PixelModel, chunks
 
@@ -88,10 +89,13 @@ class Spread:
         """
         count = y.shape[1]
         some = np.unique(np.linspace(0, count - 1, min(count, TYPICAL)).round().astype(int))
-        far = np.concatenate(
-            [np.abs(deviation(model, y[:, some[part]])) for part in chunks(len(some))], axis=1
-        )
-        far /= by_lenslet(far)
+        far = np.empty((len(y), len(some)))
+
+        def look(part: slice) -> None:
+            of_part = np.abs(deviation(model, y[:, some[part]]))
+            far[:, part] = of_part / by_lenslet(of_part)
+
+        spread([(part,) for part in chunks(len(some))], look)
         middle = NORMAL * np.median(far, axis=1).reshape(shape)
         # as scipy's median_filter, which takes longer to import than all else here
         around = sliding_window_view(np.pad(middle, AROUND // 2, mode="edge"), (AROUND, AROUND))
@@ -134,11 +138,14 @@ def find_defects(
     unknown and defective pixels imputed).
     """
     clean, sign = model.impute(y, unknown), np.zeros(y.shape, np.int8)
-    spread = common("spread", lambda: Spread.of(model, clean, shape))
-    for part in chunks(y.shape[1]):
+    usual = common("spread", lambda: Spread.of(model, clean, shape))
+
+    def look(part: slice) -> None:
         clean[:, part], sign[:, part] = _search(
-            model, spread, y[:, part], clean[:, part], unknown[:, part]
+            model, usual, y[:, part], clean[:, part], unknown[:, part]
         )
+
+    spread([(part,) for part in chunks(y.shape[1])], look)
     return sign, clean
 
 
@@ -160,13 +167,13 @@ def defects_among(
 
 
 def _search(
-    model: PixelModel, spread: Spread, y: np.ndarray, clean: np.ndarray, unknown: np.ndarray
+    model: PixelModel, usual: Spread, y: np.ndarray, clean: np.ndarray, unknown: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """(clean, sign) of some superpixels, see `find_defects`."""
     clean, bad = clean.copy(), np.zeros(y.shape, bool)
     at = np.arange(y.shape[1])
     for _ in range(ROUNDS):
-        far = np.abs(spread.over(deviation(model, clean[:, at])))
+        far = np.abs(usual.over(deviation(model, clean[:, at])))
         far[bad[:, at] | unknown[:, at]] = 0
         new = far > np.maximum(FAR, AT_ONCE * far.max(axis=0))
         at = at[new.any(axis=0)]
@@ -177,7 +184,7 @@ def _search(
     if not bad.any():
         return clean, bad.astype(np.int8)
     at = np.flatnonzero(bad.any(axis=0))
-    clean[:, at], sign = _confirmed(model, spread, y[:, at], bad[:, at], unknown[:, at])
+    clean[:, at], sign = _confirmed(model, usual, y[:, at], bad[:, at], unknown[:, at])
     signs = np.zeros(y.shape, np.int8)
     signs[:, at] = sign
     return clean, signs
@@ -185,7 +192,7 @@ def _search(
 
 def _confirmed(
     model: PixelModel,
-    spread: Spread,
+    usual: Spread,
     y: np.ndarray,
     bad: np.ndarray,
     unknown: np.ndarray,
@@ -193,7 +200,7 @@ def _confirmed(
     """(clean, sign) where pixels that only a defect nearby had spoilt are good again."""
     clean = model.impute(y, bad | unknown)
     sigma = model.uncertainty(clean, bad | unknown)
-    scale = np.maximum(1, spread.by_pixel[:, None] * by_lenslet(np.abs(deviation(model, clean))))
+    scale = np.maximum(1, usual.by_pixel[:, None] * by_lenslet(np.abs(deviation(model, clean))))
     wrong = bad & (np.abs(y - clean) > FAR * scale * sigma)
     if (wrong != bad).any():
         clean = model.impute(y, wrong | unknown)

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from plenocli.base.budget import spread
 from plenocli.inverse.picture.lenslet_model import Common, alone
 from plenocli.inverse.picture.nuisances.defects import NORMAL, by_lenslet
 from plenocli.inverse.picture.nuisances.pixel_model import PixelModel, chunks
@@ -169,11 +170,14 @@ def _possible(level: float, y: np.ndarray, sigma: float) -> bool:
 def _offsets(model: PixelModel, y: np.ndarray) -> _Offsets:
     value, variance, brightness, misfit = np.empty((4, y.shape[1]))
     even = model.free @ model.free.sum(axis=0)
-    for part in chunks(y.shape[1]):
+
+    def look(part: slice) -> None:
         rest = model.rest(y[:, part])
         value[part], variance[part] = rest.offset, rest.offset_variance
         misfit[part] = by_lenslet(np.abs(rest.value) / (model.sigma * np.sqrt(rest.open)))
         brightness[part] = even @ y[:, part] / (even @ even)
+
+    spread([(part,) for part in chunks(y.shape[1])], look)
     return _Offsets(value, variance, brightness, misfit)
 
 
@@ -226,8 +230,8 @@ def _straight_line(value: np.ndarray, brightness: np.ndarray) -> _Line:
             return _Line(0.0, np.inf, False)
         level, slope = np.linalg.solve(normal, design.T @ (weight * value))
         far = np.abs(value - level - slope * brightness)
-        spread = max(NORMAL * float(np.median(far)), np.finfo(float).tiny)
-        weight = 1 / np.maximum(1, far / (1.5 * spread))
-    own, of_slope = spread * np.sqrt(np.diag(np.linalg.inv(normal)))
+        usual = max(NORMAL * float(np.median(far)), np.finfo(float).tiny)
+        weight = 1 / np.maximum(1, far / (1.5 * usual))
+    own, of_slope = usual * np.sqrt(np.diag(np.linalg.inv(normal)))
     bent = NOT_STRAIGHT * slope * float(np.mean(brightness))
     return _Line(float(level), float(np.hypot(own, bent)), bool(abs(slope) > SURE * of_slope))

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from plenocli.base.linear_maps import product
+
 
 @dataclass(frozen=True)
 class Svd:
@@ -91,7 +93,8 @@ def estimate_noise(svd: Svd, y: np.ndarray) -> float:
             "the noise cannot be estimated: the system matrix reaches every pixel pattern",
             fix="give --noise-sigma",
         )
-    residual = y - svd.u[:, :reached] @ (svd.u[:, :reached].T @ y)
+    reach = svd.u[:, :reached]
+    residual = y - product(reach, product(reach.T, y))
     return float(np.sqrt(np.sum(residual**2) / (left * y.shape[1])))
 
 

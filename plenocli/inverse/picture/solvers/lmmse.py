@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from plenocli.base.linear_maps import product
 from plenocli.inverse.picture.lenslet_model import Common, Keep, alone, work_out
 from plenocli.inverse.picture.solvers.least_squares import Svd
 
@@ -79,6 +80,16 @@ class Lmmse:
             self.even @ (self.levels @ y) + self.mean[:, None] + self.gain @ self.shrunk(w, scale)
         )
 
+    def likely(self, y: np.ndarray, common: Common = alone) -> np.ndarray:
+        """The same, each signal with a scale of its own (see `scales`)."""
+        w = self.coordinates(y)
+        return self.apply(y, mean_scale(self.contrast(w, common)), w)
+
+    def likely_detail(self, y: np.ndarray) -> np.ndarray:
+        """What `gain` takes to the field of it, (k, signal)."""
+        w = self.coordinates(y)
+        return self.shrunk(w, mean_scale(self.contrast(w)))
+
     def shrunk(self, w: np.ndarray, scale: float | np.ndarray) -> np.ndarray:
         """What `gain` takes back to the field, (k, signal), of coordinates w (k, signal)."""
         noise = self.noise[:, None] / np.broadcast_to(scale, w.shape[1:])
@@ -122,7 +133,7 @@ class Lmmse:
 
     def coordinates(self, y: np.ndarray) -> np.ndarray:
         """Uncorrelated coordinates (k, signal) of y (pixel, signal)."""
-        return self.analysis @ y - self.offset[:, None]
+        return product(self.analysis, y) - self.offset[:, None]
 
     def scales(self, y: np.ndarray, common: Common = alone) -> np.ndarray:
         """The scale of each signal: the posterior mean of its logarithm (see `contrast`).

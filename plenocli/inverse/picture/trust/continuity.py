@@ -95,7 +95,7 @@ def detail_jumps(lmmse: Lmmse, y: np.ndarray, shape: tuple[int, int]) -> Jumps:
     pixel), by `groups` of its coordinates; shape as in `jumps`.
     """
     stacked = y.reshape(-1, y.shape[-1]).T
-    shrunk = lmmse.shrunk(lmmse.coordinates(stacked), lmmse.scales(stacked))
+    shrunk = lmmse.likely_detail(stacked)
     level = lmmse.even @ (lmmse.levels @ stacked)
 
     def of(x: np.ndarray) -> np.ndarray:

@@ -91,7 +91,7 @@ def guarded(
     def share() -> float:
         kept, detail = detail_kept(found.value, mean, belief, shape), found.value - mean
         if svd is not None:
-            likely = lmmse.apply(stacked, lmmse.scales(stacked)).T.reshape(detail.shape) - mean
+            likely = lmmse.likely(stacked).T.reshape(detail.shape) - mean
             least = likely_share(detail, likely)
             if least < kept and is_noise(found.value, detail, svd, belief.level.sigma):
                 return least

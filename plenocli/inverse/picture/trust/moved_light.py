@@ -13,7 +13,7 @@ import numpy as np
 
 from plenocli.inverse.picture.lenslet_model import LensletMatrix
 from plenocli.inverse.picture.solvers.least_squares import Svd
-from plenocli.inverse.picture.solvers.lmmse import Lmmse
+from plenocli.inverse.picture.solvers.lmmse import Lmmse, mean_scale
 from plenocli.inverse.picture.trust.rough_scene import reached
 
 MOTIONS = 10
@@ -63,11 +63,11 @@ def _beyond(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Slopes (motion,) of the likelihood of what no object gives, and their covariance."""
     # a star has far more light than brightness and pixels tell
-    energy = np.sum(lmmse.apply(y, lmmse.scales(y)) ** 2, axis=0)
+    energy = np.sum(lmmse.likely(y) ** 2, axis=0)
     basis = reached(svd, float(energy.mean()), sigma)
     seen = basis @ (basis.T @ y)
     rest = (y - seen).ravel() / sigma
-    moved = motions(system, lmmse.apply(seen, lmmse.scales(seen)), svd) / sigma
+    moved = motions(system, lmmse.likely(seen), svd) / sigma
     moved -= basis @ np.einsum("pk,mpl->mkl", basis, moved, optimize=True)
     moved = moved.reshape(len(moved), -1)
     slopes, weighted = moved @ rest, moved * rest
@@ -86,14 +86,15 @@ def _within(
     them and is left out; lenslets that are like no photograph count for less. The covariance is the
     mean of that of photographs and that of the estimates at hand.
     """
-    scales = lmmse.scales(y)
+    w = lmmse.coordinates(y)
+    scales = mean_scale(lmmse.contrast(w))
     loud = lmmse.power * scales.max() > LOUD * lmmse.noise
     if not loud.any():
         return np.zeros(MOTIONS), np.zeros((MOTIONS, MOTIONS))
     power, noise = lmmse.power[loud], lmmse.noise[loud]
     moves = lmmse.analysis[loud] @ motions(system, lmmse.gain[:, loud], svd)
     moves *= 1 - np.eye(len(power))
-    w, variance = lmmse.coordinates(y)[loud], scales * power[:, None] + noise[:, None]
+    w, variance = w[loud], scales * power[:, None] + noise[:, None]
     pull = w / variance
     weight = 1 / np.maximum(1, np.sum(w * pull, axis=0) / max(len(w), 1))
     share, moved = weight / weight.sum(), scales * (moves @ pull)

@@ -46,7 +46,7 @@ def spoilt_by_matrix(lmmse: Lmmse, y: np.ndarray) -> bool:
     scene: a pattern in proportion to brightness, or much negative light.
     """
     bright = lmmse.brightness(y)
-    detail = lmmse.gain @ lmmse.shrunk(lmmse.coordinates(y), lmmse.scales(y))
+    detail = lmmse.gain @ lmmse.likely_detail(y)
     energy = float(np.sum(detail**2))
     if not energy > 0:
         return False

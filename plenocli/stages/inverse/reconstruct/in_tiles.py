@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -10,15 +11,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from plenocli.base.budget import budget, within
 from plenocli.base.errors import PlenoError
 from plenocli.base.progress import bar, collected_notes, note
 from plenocli.execution.pool import Pool, run_all
 from plenocli.files.artefacts.provenance import file_digest
 from plenocli.files.bench import Bench
 from plenocli.files.read.captures import superpixel_source
+from plenocli.inverse.picture.diagnosis import Seen
 from plenocli.inverse.picture.estimate import estimate
 from plenocli.inverse.picture.estimators import Estimators
-from plenocli.inverse.picture.footprint import cleaned, require_reconstruction
+from plenocli.inverse.picture.footprint import cleaned, pieces_at_once, require_reconstruction
 from plenocli.inverse.picture.lenslet_model import Superpixels, Whole
 from plenocli.inverse.picture.methods.method import Sees
 from plenocli.inverse.picture.methods.registry import METHODS
@@ -28,6 +31,7 @@ from plenocli.inverse.picture.tiles import (
     Source,
     Tile,
     joined,
+    largest_tile,
     side_of,
     spread_over,
     survey,
@@ -50,30 +54,11 @@ def picture_in_tiles(
     target: Path,
 ) -> Solved:
     """The picture of a capture that is larger than a tile."""
-    settings, estimators = recipe.settings, estimators_of(recipe)
-    method, system = METHODS[settings.method], estimators.system
-    look = method.sees is not Sees.LENSLET_AS_IS
-    whole, middle = survey(system, source, side_of(system))
-    data = source.cut(*middle.own)
-    most = max(tiles, key=lambda t: np.prod([p.stop - p.start for p in t.around]))
-    require_reconstruction(
-        estimators,
-        source.cut(*most.around),
-        capture,
-        cleaned(method.phases) if look else method.phases,
-        joint=method.makes_joint_estimate(estimators),
-    )
-    limits, finer = limits_of(estimators, data), False
-    if look and limits is not None and limits.limited_by == "model":
-        better = finer_of(recipe)
-        finer, estimators = better is not None, better or estimators
-        limits = limits_of(estimators, data)
-    off = error_that_counts(limits)
-    task = _TileTask(
-        recipe=recipe, capture=capture, target=target, finer=finer, model_error=off, whole=whole
-    )
-    data, cause = replace(data, whole=whole), partial(likely_cause, estimators)
-    sample, seen = estimate(estimators, method, data, model_error=off, explain=cause)
+    settings, system = recipe.settings, estimators_of(recipe).system
+    # what comes before there are tiles is worked out by as many threads
+    with within(replace(budget(), threads=settings.workers)):
+        typical = _Typical.of(recipe, capture, source, tiles, target)
+    sample, task = typical.found, typical.task
     all_weigh = METHODS[sample.method].weighs_all  # of the one that auto took
     task = task.sharing(pool, tiles if all_weigh else spread_over(source.count, side_of(system)))
     depends = replace(settings, workers=1), recipe.digests, file_digest(capture), tiles
@@ -82,21 +67,89 @@ def picture_in_tiles(
     stats = solve_all(pool, task, tiles, bench, clip)
     value, sigma, counted = picture(bench, tiles, system.object_shape, max(1, len(system.bands)))
     size = source.count[0] * source.count[1] * system.own.shape[0]
-    declared = data.saturated is not None
     parts: dict[str, Any] = {"value": value, "sigma": sigma, "stats": stats or sample.stats}
-    trace = joined(sample, counted[1:], size, declared=declared)
+    trace = joined(sample, counted[1:], size, declared=typical.declared)
     for entry in trace:
         if isinstance(entry, NUISANCES) and entry.found:
             note(entry.sentence)
     return Solved(
         found=replace(sample, trace=trace, **parts),
-        seen=seen,
-        limits=limits,
+        seen=typical.seen,
+        limits=typical.limits,
         negative_share=float(counted[0]) / np.prod(value.shape),
         block=system.object_shape,
         bands=system.bands,
         bench=bench,
     )
+
+
+def tiles_at_once(recipe: Recipe) -> int:
+    """How many of its workers, threads of this process, the memory holds with a tile each."""
+    estimators, method = estimators_of(recipe), METHODS[recipe.settings.method]
+    look = method.sees is not Sees.LENSLET_AS_IS
+    return pieces_at_once(
+        estimators,
+        largest_tile(estimators, method),
+        cleaned(method.phases) if look else method.phases,
+        joint=method.makes_joint_estimate(estimators),
+        most=recipe.settings.workers,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Typical:
+    """What the square that is most like a capture tells of it.
+
+    found: of the square.
+    seen: of its objects.
+    limits: whether noise or the matrix decides.
+    declared: whether the capture says where its sensor saturates.
+    task: for tiles, which knows all this.
+    """
+
+    found: Reconstruction
+    seen: Seen | None
+    limits: Limits | None
+    declared: bool
+    task: _TileTask
+
+    @classmethod
+    def of(
+        cls, recipe: Recipe, capture: Path, source: Source, tiles: Sequence[Tile], target: Path
+    ) -> _Typical:
+        """Of a capture whose tiles fit the memory. Raises NumericsError."""
+        estimators = estimators_of(recipe)
+        method, system = METHODS[recipe.settings.method], estimators.system
+        look = method.sees is not Sees.LENSLET_AS_IS
+        whole, middle = survey(system, source, side_of(system))
+        data = source.cut(*middle.own)
+        most = max(math.prod(part.stop - part.start for part in tile.around) for tile in tiles)
+        require_reconstruction(
+            estimators,
+            most,
+            data.sigma,
+            capture,
+            cleaned(method.phases) if look else method.phases,
+            joint=method.makes_joint_estimate(estimators),
+        )
+        limits, finer = limits_of(estimators, data), False
+        if look and limits is not None and limits.limited_by == "model":
+            better = finer_of(recipe)
+            finer, estimators = better is not None, better or estimators
+            limits = limits_of(estimators, data)
+        off = error_that_counts(limits)
+        declared = data.saturated is not None
+        data, cause = replace(data, whole=whole), partial(likely_cause, estimators)
+        found, seen = estimate(estimators, method, data, model_error=off, explain=cause)
+        task = _TileTask(
+            recipe=recipe,
+            capture=capture,
+            target=target,
+            finer=finer,
+            model_error=off,
+            whole=whole,
+        )
+        return cls(found=found, seen=seen, limits=limits, declared=declared, task=task)
 
 
 @dataclass(frozen=True, kw_only=True)

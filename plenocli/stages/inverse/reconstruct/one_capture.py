@@ -90,7 +90,8 @@ def reconstruct_capture(
     look = method.sees is not Sees.LENSLET_AS_IS
     require_reconstruction(
         estimators,
-        data,
+        data.y.shape[0] * data.y.shape[1],
+        data.sigma,
         capture,
         cleaned(method.phases) if look else method.phases,
         joint=method.makes_joint_estimate(estimators),

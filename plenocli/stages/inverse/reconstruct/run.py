@@ -5,10 +5,12 @@ neighbours.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+from plenocli.base.budget import budget, within
 from plenocli.base.errors import UsageError
 from plenocli.execution.batch import BatchSummary, outcomes, plan_batch, summarise
 from plenocli.execution.pool import InProcess, open_pool
@@ -18,6 +20,7 @@ from plenocli.files.read.captures import (
 )
 from plenocli.files.read.training import files_of
 from plenocli.inverse.picture.methods.registry import METHODS, takers
+from plenocli.stages.inverse.reconstruct.in_tiles import tiles_at_once
 from plenocli.stages.inverse.reconstruct.one_capture import reconstruct_capture
 from plenocli.stages.inverse.reconstruct.recipe import (
     Settings,
@@ -46,8 +49,9 @@ def run_reconstruct(
 ) -> ReconstructSummary:
     """Reconstruct every capture.
 
-    Several go to settings.workers processes, or to a Dask cluster; so do batches of the lenslets of
-    a single one, by methods that take long over each. Finished ones are skipped unless overwrite.
+    Several go to settings.workers processes, or to a Dask cluster; so do tiles of a single one, or
+    batches of its lenslets by methods that take long over each, or to as many threads where these
+    serve as well. Finished ones are skipped unless overwrite.
     One that fails does not stop the others; an error with the worst exit code follows at the end.
 
     captures: files, folders of them, or patterns (plenocli.files.read.captures.named_captures).
@@ -78,12 +82,17 @@ def run_reconstruct(
 
     def write(solved: Solved, capture: Path, target: Path) -> PictureSummary:
         inputs = _inputs(settings, capture, pif, calibration)
-        return write_picture(target, solved, settings, command, inputs, overwrite)
+        # of a single one nothing is estimated any more
+        with within(replace(budget(), threads=settings.workers if split else 1)):
+            return write_picture(target, solved, settings, command, inputs, overwrite)
 
     try:
         if pif:  # a broken one ends the run here, before any capture
             estimators_of(recipe) if split or not pooled else system_of(recipe)
-        with open_pool(workers, scheduler) as pool:
+        threads = split and method.in_threads
+        if threads and pif:
+            workers = min(workers, tiles_at_once(recipe))
+        with open_pool(workers, scheduler, threads=threads) as pool:
             if split and pooled and pif:
                 estimators_of(recipe).elsewhere = partial(solve_in_pool, recipe, pool)
             tasks = pool if split else InProcess()

@@ -107,7 +107,7 @@ def drawn_white(folder, method):
     white = folder / "white.h5"
     settings = demux.Settings(method=method, reference=white, register="off")
     return demux.CaptureDemultiplexer(
-        folder / "response.h5", settings, overwrite=False, command=""
+        folder / "response.h5", settings, {}, overwrite=False, command=""
     ).reference.value
 
 

@@ -231,7 +231,7 @@ def measure(run, kind, rounds):
             return raw.raw_image_visible.copy()
 
     worker = clock.time(
-        "prepare", lambda: CaptureDemultiplexer(run / f"{kind}.h5", Settings(), True, "")
+        "prepare", lambda: CaptureDemultiplexer(run / f"{kind}.h5", Settings(), {}, True, "")
     )
     exposure = read_capture(shot, cfa=worker.solver.responses.cfa)
     # and what it leaves for the others

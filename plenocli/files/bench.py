@@ -72,13 +72,12 @@ class Bench:
                 f"the folder of its tiles cannot be made ({error.strerror})", self.target
             ) from error
 
-    def remove(self) -> None:
-        """Its tiles are no longer needed."""
-        shutil.rmtree(self.folder, ignore_errors=True)
-
 
 def clear(target: Path, but: Path | None = None) -> None:
-    """Remove the folders of tiles that killed runs towards a result left; but: one of them."""
+    """Remove the folders of tiles of a result, which is written, or of other runs towards it.
+
+    but: the one that is needed.
+    """
     digest = "[0-9a-f]" * DIGITS  # and not *, which results of longer names have
     for folder in target.parent.glob(f".{glob.escape(target.name)}.{digest}.tiles"):
         if folder != but:

@@ -26,7 +26,7 @@ def test_a_tile_is_made_once_and_each_name_has_its_own(tmp_path):
     again = Bench.beside(tmp_path / "out.h5", "settings")
     assert again.folder == bench.folder and again.get("0-4") is not None
     assert again.under("another").get("0-4") is None
-    bench.remove()
+    clear(bench.target)
     assert not list(tmp_path.iterdir())
     kept(FORGETFUL.under("other"), "0-4", lambda: make([1.0]))
     kept(FORGETFUL, "0-4", lambda: make([1.0]))

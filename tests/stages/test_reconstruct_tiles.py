@@ -140,6 +140,16 @@ def test_threads_are_as_many_as_the_memory_holds(folder, monkeypatch, tmp_path, 
     assert max(most) == 2
 
 
+def test_a_result_in_one_piece_leaves_no_tiles_of_earlier_runs(folder, tmp_path):
+    made, _ = folder
+    left, other = (tmp_path / f".{name}.{'0f' * 8}.tiles" for name in ("out.h5", "out.h5.h5"))
+    for path in (left, other):
+        path.mkdir()
+        (path / "000000").write_text("a tile")
+    picture(made / "alone", tmp_path / "out.h5", method="tikhonov")
+    assert not left.exists() and other.exists()
+
+
 def test_a_run_that_ended_goes_on_from_its_tiles(folder, tmp_path, small_tiles, monkeypatch):
     made, _ = folder
     picture(made / "alone", tmp_path / "right.h5", method="lmmse")

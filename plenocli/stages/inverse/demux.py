@@ -27,7 +27,6 @@ from plenocli.inverse.spectra.demultiplexer import Demultiplexer, method_of_whit
 
 if TYPE_CHECKING:
     from plenocli.execution.batch import Batch, BatchSummary
-    from plenocli.files.bench import Bench
     from plenocli.inverse.calibration.calibration import Calibration
     from plenocli.inverse.registration.alignment import Registration
     from plenocli.inverse.spectra.spectra import Spectra
@@ -324,8 +323,8 @@ class CaptureDemultiplexer:
         found, described = read_described(
             calibration, needs=("response", "windows", "white", "dark"), in_file=True
         )
-        self.bench = None if several else self._bench(*next(iter(targets.items())), found)
-        self.keeper: Keeper = self.bench or FORGETFUL
+        only = None if several else next(iter(targets.items()))
+        self.keeper: Keeper = FORGETFUL if only is None else self._keeper(*only, found)
         self.solver = Demultiplexer(
             found,
             method=settings.method,
@@ -343,16 +342,15 @@ class CaptureDemultiplexer:
         if settings.reference is not None:
             self.reference = self.demux(settings.reference, self._method_of_reference())[0]
 
-    def _bench(self, capture: Path, target: Path, calibration: Calibration) -> Bench | None:
-        """Where tiles are kept until the result is written; None where there are few."""
-        from plenocli.files.bench import Bench, clear
+    def _keeper(self, capture: Path, target: Path, calibration: Calibration) -> Keeper:
+        """What keeps tiles until the result is written, but where there are few."""
+        from plenocli.files.bench import Bench
         from plenocli.inverse.calibration.calibration import there
         from plenocli.inverse.spectra.factored import tile_of
 
         lenslets = int(calibration.grid.valid.sum())
         if lenslets < FEW * tile_of(there(calibration.response).matrix):
-            clear(target)
-            return None
+            return FORGETFUL
         plain = replace(self.settings, reference=None, camera=None, prior=None)
         return Bench.beside(target, (plain, self.inputs, describe_capture(capture)))
 
@@ -383,6 +381,7 @@ class CaptureDemultiplexer:
     ) -> CaptureSummary:
         """Write what `demux` returned for `capture` to the file `target`."""
         from plenocli.files.artefacts.provenance import Provenance
+        from plenocli.files.bench import clear
         from plenocli.files.images.spectra import write_spectra
 
         found, own = done
@@ -402,8 +401,7 @@ class CaptureDemultiplexer:
             reference=self.settings.reference,
             overwrite=self.overwrite,
         )
-        if self.bench is not None:
-            self.bench.remove()
+        clear(Path(target))
         return _capture_summary(found, capture, target)
 
 

@@ -177,17 +177,16 @@ def _refocused(
     )
     if in_file and target.suffix != ".h5":
         field = field.in_memory()
-    return _Refocused(field=field, source=source, inputs=inputs, bench=bench)
+    return _Refocused(field=field, source=source, inputs=inputs)
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Refocused:
-    """A light field, what it was made from, and where what is finished of it is kept."""
+    """A light field, and what it was made from."""
 
     field: LightField
     source: SampleBands
     inputs: dict[str, dict[str, str]]
-    bench: Bench | None
 
 
 def _bench(target: Path, source: SampleBands, tried: np.ndarray, depends: Any) -> Bench | None:
@@ -195,10 +194,9 @@ def _bench(target: Path, source: SampleBands, tried: np.ndarray, depends: Any) -
 
     depends: all that it depends on, beside the code and how the capture is cut into bands.
     """
-    from plenocli.files.bench import Bench, clear
+    from plenocli.files.bench import Bench
 
     if len(source.rows) * len(tried) < LARGE:
-        clear(target)
         return None
     return Bench.beside(target, (depends, source.rows))
 
@@ -213,13 +211,13 @@ def _write(
 ) -> RefocusSummary:
     """Write one light field."""
     from plenocli.files.artefacts.provenance import Provenance
+    from plenocli.files.bench import clear
     from plenocli.files.results.lightfields import write_lightfield
 
     field, source = done.field, done.source
     provenance = Provenance(command=command, inputs=done.inputs, seed=0)
     write_lightfield(target, field, source, provenance, overwrite=overwrite)
-    if done.bench is not None:
-        done.bench.remove()
+    clear(target)
     known, beyond = _told(field.depth, field.slopes)
     best = int(np.argmax(field.sharpness))
     distance = np.nan if field.distances is None else float(field.distances[best])

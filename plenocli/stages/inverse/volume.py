@@ -15,7 +15,6 @@ from plenocli.base.units import format_length
 
 if TYPE_CHECKING:
     from plenocli.files.artefacts.provenance import Provenance
-    from plenocli.files.bench import Bench
     from plenocli.files.results.volumes import StoredVolume
     from plenocli.files.scratch import Scratch
     from plenocli.forward.volume.stack import Stack
@@ -118,6 +117,7 @@ def run_volume(
     from plenocli.base.device import device as device_of
     from plenocli.files.artefacts.provenance import Provenance, describe_inputs
     from plenocli.files.atomic import check_output
+    from plenocli.files.bench import clear
     from plenocli.files.results.stacks import read_stack
     from plenocli.files.results.volumes import read_volume, same_voxels
     from plenocli.files.scratch import Scratch
@@ -158,15 +158,14 @@ def run_volume(
     if background == "auto":
         _take_haze(tiles)
     files, settings = describe_inputs(inputs), (hold_out, background, most_planes, channel, seed)
-    bench = _bench(output, tiles, (*settings, there.name, files))
+    _keep(output, tiles, (*settings, there.name, files))
     volume = tiles.volume()
     volume = replace(volume, trace=(*trials, *volume.trace))
     provenance = Provenance(
         command=command, inputs=files, seed=seed, accuracy=stack.accuracy.as_json()
     )
     _write(output, volume, stack, provenance, overwrite, there.name)
-    if bench is not None:
-        bench.remove()
+    clear(output)
     summary = _summary(output, volume, stack)
     if other is not None and summary.explained_db is not None:
         _tell_of_the_clearer(summary.explained_db, other, str(like))
@@ -268,21 +267,18 @@ def _plan(output: Path, tiles: Tiles) -> None:
     )
 
 
-def _bench(output: Path, tiles: Tiles, depends: Any) -> Bench | None:
-    """Where the volumes of several windows are kept until the result is written, which then comes
-    from there; None of one.
+def _keep(output: Path, tiles: Tiles, depends: Any) -> None:
+    """Have the volumes of several windows kept until the result is written.
 
     depends: all that they depend on, beside the windows.
     """
     from plenocli.files.bench import Bench
     from plenocli.stages.inverse.kept_windows import kept_part
 
-    if len(tiles.windows) == 1:
-        return None
-    places = [(w.rows, w.columns) for w in tiles.windows]
-    bench = Bench.beside(output, (depends, tiles.method, places))
-    tiles.keep = partial(kept_part, bench)
-    return bench
+    if len(tiles.windows) > 1:
+        places = [(w.rows, w.columns) for w in tiles.windows]
+        bench = Bench.beside(output, (depends, tiles.method, places))
+        tiles.keep = partial(kept_part, bench)
 
 
 def _take_haze(tiles: Tiles) -> None:

@@ -79,7 +79,6 @@ def picture_in_tiles(
         negative_share=float(counted[0]) / np.prod(value.shape),
         block=system.object_shape,
         bands=system.bands,
-        bench=bench,
     )
 
 

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from plenocli.files.bench import Bench
 from plenocli.inverse.picture.diagnosis import Seen
 from plenocli.inverse.picture.reconstruction import Account, Reconstruction
 
@@ -24,7 +23,6 @@ class Solved:
     seen: what of an object the sensor tells apart, None where the noise is not known.
     limits: what limits it, None where that is not known.
     negative_share: of the values, before they are clipped.
-    bench: of the tiles that it consists of, None where it is in memory.
     block: points (rows, columns) of an object, None without a system matrix.
     bands: wavelengths (m) of the bands, () for one picture.
     rgb: (3, row, column) linear sRGB of a capture whose pixels have colours; None of others.
@@ -37,7 +35,6 @@ class Solved:
     block: tuple[int, int] | None = None
     bands: tuple[float, ...] = ()
     rgb: np.ndarray | None = None
-    bench: Bench | None = None
 
     def summary(self, output: Path, *, clipped: bool) -> PictureSummary:
         """What there is to tell of it once it is written to `output`."""

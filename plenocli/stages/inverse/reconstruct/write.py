@@ -25,13 +25,13 @@ def write_picture(
 ) -> PictureSummary:
     """Write one picture."""
     from plenocli.files.artefacts.provenance import Provenance
+    from plenocli.files.bench import clear
 
     provenance = Provenance(command=command, inputs=inputs, seed=settings.seed)
     summary = solved.summary(target, clipped=settings.clip)
     write = _write_exr if target.suffix == ".exr" else _write_artefact
     write(target, solved, summary, provenance, overwrite)
-    if solved.bench is not None:
-        solved.bench.remove()
+    clear(target)
     return summary
 
 

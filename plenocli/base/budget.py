@@ -12,7 +12,7 @@ import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextvars import copy_context
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -138,6 +138,11 @@ def within(new: Budget | None = None) -> Iterator[None]:
         yield
     finally:
         _current = before
+
+
+def on_threads(count: int) -> contextlib.AbstractContextManager[None]:
+    """A context in which the budget has `count` threads."""
+    return within(replace(budget(), threads=count))
 
 
 def one_thread() -> contextlib.AbstractContextManager:

@@ -18,7 +18,7 @@ import numpy as np
 
 from plenocli.base.budget import spread
 from plenocli.base.device import CPU, Device, namespace
-from plenocli.base.tiling import bands
+from plenocli.base.tiling import spread_bands
 
 CHUNK = 1 << 25
 """Bytes of kernels that are transformed at a time."""
@@ -325,7 +325,7 @@ def product(matrix: np.ndarray, columns: np.ndarray) -> np.ndarray:
     def work(part: slice) -> None:
         np.matmul(matrix, columns[:, part], out=made[:, part])
 
-    spread([(part,) for part in bands(columns.shape[1], COLUMNS)], work)
+    spread_bands(columns.shape[1], COLUMNS, work)
     return made
 
 

@@ -15,6 +15,7 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
+from plenocli.base.budget import spread
 from plenocli.base.device import namespace
 
 T = TypeVar("T")
@@ -109,6 +110,11 @@ class InParts:
 
 EVERYTHING = slice(None)
 
+Room = Callable[..., Any]
+"""What gives room for values of a shape, and of a dtype if one is named, put and looked at by
+slices: np.empty, or a file beside a result (plenocli.files.scratch.Scratch).
+"""
+
 
 class Keeper(Protocol):
     """What keeps the arrays of finished tiles by their names, for a run that comes after one that
@@ -201,6 +207,11 @@ def bands(count: int, most: int) -> list[slice]:
     """Rows 0 to `count` in bands of `most` (at least one), the last of what is left."""
     most = max(1, most)
     return [slice(start, min(start + most, count)) for start in range(0, count, most)]
+
+
+def spread_bands(count: int, most: int, work: Callable[[slice], object]) -> None:
+    """work(rows) for `bands` of 0 to `count`, on as many threads as the budget has."""
+    spread([(rows,) for rows in bands(count, most)], work)
 
 
 def windows(blocks: Iterable[np.ndarray], wanted: Iterable[slice]) -> Iterator[np.ndarray]:

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ import numpy as np
 
 from plenocli.base.budget import budget
 from plenocli.base.errors import InputError
-from plenocli.base.tiling import Plane
+from plenocli.base.tiling import Plane, Room
 
 DECODED = 1 << 22
 """Bytes of a band of rows that a decoder sends, at most, about."""
@@ -23,10 +23,6 @@ SHARE = 16
 FURTHEST = 1e100
 """Of the largest value of a capture from 1, in either direction."""
 _FIX = "make or copy it again"
-Room = Callable[..., Any]
-"""What gives room for values of a shape and dtype, put and looked at by rows and columns, beside
-the memory (plenocli.files.scratch.Scratch).
-"""
 
 
 def rows_of(line: int) -> int:

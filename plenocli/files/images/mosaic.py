@@ -17,12 +17,12 @@ import numpy as np
 
 from plenocli.base.budget import budget
 from plenocli.base.errors import InputError
-from plenocli.base.tiling import EVERYTHING, InParts, Plane
+from plenocli.base.tiling import EVERYTHING, InParts, Plane, Room
 from plenocli.files.artefacts.provenance import Provenance, first_bytes, provenance_texts
 from plenocli.files.images.containers import BIO, LYTRO, Contained, read_bio, read_lytro, read_pages
 from plenocli.files.images.dng import write_dng
 from plenocli.files.images.exr import Header, read_exr, read_header, stored_channel, write_exr
-from plenocli.files.images.in_bands import SHARE, Room, put_together, require_sound, sound
+from plenocli.files.images.in_bands import SHARE, put_together, require_sound, sound
 from plenocli.files.images.pictures import file_type, stored_in_parts
 from plenocli.files.images.raw import RawFile, read_raw
 from plenocli.forward.sensor.capture import Capture, CaptureMetadata, Levels, SuperpixelGrid

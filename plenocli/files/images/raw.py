@@ -18,10 +18,10 @@ import numpy as np
 
 from plenocli.base.budget import budget
 from plenocli.base.errors import InputError, PlenoError
-from plenocli.base.tiling import Plane, bands
+from plenocli.base.tiling import Plane, Room, bands
 from plenocli.files.artefacts.provenance import require_file
 from plenocli.files.images.dng import read_notes
-from plenocli.files.images.in_bands import Room, put_together, rows_of, whole_bands
+from plenocli.files.images.in_bands import put_together, rows_of, whole_bands
 from plenocli.files.outside import outside, outside_in_parts
 from plenocli.files.seal import require_seal
 from plenocli.forward.sensor.cfa import ColourProfile

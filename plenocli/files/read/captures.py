@@ -280,6 +280,13 @@ def _opened(path: Path, beside: Path | None, *, anew: bool) -> _Windows:
         return _open[0][1]
 
 
+def forget_captures() -> None:
+    """Let go what was opened last, and the files that it was decoded to."""
+    with _turn:
+        _open.clear()
+        _along_the_grid.cache_clear()
+
+
 def _stamp(path: str | Path) -> tuple[int, int]:
     """What tells a file from another one of its name. Raises InputError."""
     size = require_file(path)

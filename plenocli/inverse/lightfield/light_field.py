@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from plenocli.base.budget import budget
-from plenocli.base.tiling import BAND, EVERYTHING, FORGETFUL, Keeper, around, bands, shared
+from plenocli.base.tiling import BAND, EVERYTHING, FORGETFUL, Keeper, Room, around, bands, shared
 from plenocli.inverse.lightfield.depth import (
     depth,
     depth_in_reach,
@@ -25,8 +25,6 @@ from plenocli.inverse.lightfield.optics import MicroscopeOptics, Optics
 from plenocli.inverse.lightfield.planes import Colours, DepthMap, LightField
 from plenocli.inverse.lightfield.refocus import STEP, Parts, pictures, views_in_bands
 from plenocli.inverse.lightfield.samples import AT_ONCE, TEMPORARY_BYTES, SampleBands
-
-Room = Callable[[tuple[int, ...]], Any]
 
 RANGE = 3.0
 """Slopes from -RANGE to RANGE are searched first where no distances are given: a lenslet's width of

@@ -12,14 +12,14 @@ import numpy as np
 from plenocli.base.errors import InputError
 from plenocli.base.progress import note
 from plenocli.base.text import by
-from plenocli.base.tiling import EVERYTHING, Plane, bands, to_blocks
+from plenocli.base.tiling import EVERYTHING, Plane, Room, bands, to_blocks
 from plenocli.forward.propagation.accuracy_record import AccuracyRecord
 from plenocli.forward.sensor.frames import saturated
 from plenocli.forward.sensor.noise import Noise
 from plenocli.forward.sensor.superpixel import extract_rows
 from plenocli.inverse.calibration.calibration import there
 from plenocli.inverse.picture.lenslet_model import LensletMatrix, Superpixels
-from plenocli.inverse.picture.nuisances.vignetting import Room, falloff_in_bands
+from plenocli.inverse.picture.nuisances.vignetting import falloff_in_bands
 from plenocli.inverse.picture.real_light import above_dark, along_the_grid
 from plenocli.inverse.picture.tiles import EVERY, Area
 

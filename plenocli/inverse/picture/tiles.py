@@ -13,8 +13,7 @@ from typing import Protocol
 
 import numpy as np
 
-from plenocli.base.budget import spread
-from plenocli.base.tiling import bands
+from plenocli.base.tiling import bands, spread_bands
 from plenocli.inverse.picture.estimate import BRIGHTNESS
 from plenocli.inverse.picture.estimators import Estimators
 from plenocli.inverse.picture.lenslet_model import LensletMatrix, Superpixels, Whole
@@ -140,7 +139,7 @@ def survey(system: LensletMatrix, source: Source, tile: int) -> tuple[Whole, Til
         levels[rows], power[rows] = found.mean(axis=2), np.mean(found**2, axis=2)
         detail[rows] = np.sqrt(np.mean((y - found @ system.even.T) ** 2, axis=2))
 
-    spread([(rows,) for rows in bands(count[0], max(1, tile**2 // count[1]))], look)
+    spread_bands(count[0], tile**2 // count[1], look)
     unit = math.sqrt(float(power.mean())) / BRIGHTNESS
     return Whole({"unit": {None: unit if unit > 0 else 1.0}}), _typical(levels, detail, tile)
 

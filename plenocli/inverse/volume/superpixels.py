@@ -13,7 +13,7 @@ import numpy as np
 
 from plenocli.base.errors import InputError, UsageError
 from plenocli.base.text import by
-from plenocli.base.tiling import EVERYTHING, Plane, bands, in_cells, in_lenslets
+from plenocli.base.tiling import EVERYTHING, Plane, Room, bands, in_cells, in_lenslets
 from plenocli.forward.sensor.capture import SuperpixelGrid
 from plenocli.forward.sensor.cfa import cfa_map
 from plenocli.forward.sensor.frames import saturated
@@ -46,8 +46,6 @@ count for nothing anyhow.
 """
 MARGIN = 64
 """Pixels beyond superpixels that are read with them: splines forget what is further away."""
-Room = Callable[[tuple[int, ...]], Any]
-"""What gives room for values of a shape, which are put and looked at by slices."""
 DIM = 0.05
 """Of the usual white level, below which a lenslet counts for nothing."""
 

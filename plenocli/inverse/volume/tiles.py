@@ -16,7 +16,7 @@ from plenocli.base.budget import budget
 from plenocli.base.device import CPU, Device
 from plenocli.base.linear_maps import BlockCirculant, torus_for
 from plenocli.base.progress import bar
-from plenocli.base.tiling import bands
+from plenocli.base.tiling import Room, bands
 from plenocli.forward.volume.stack import Stack
 from plenocli.inverse.volume import total_variation
 from plenocli.inverse.volume.choose import as_before, volume_of
@@ -35,8 +35,6 @@ DEARER = 1.5
 """Times the least work, above which smaller windows are taken after all."""
 HELD_BYTES = 12
 """Memory for a pixel that was put aside, while windows are worked on."""
-Room = Callable[[tuple[int, ...]], Any]
-"""What gives room for values of a shape, zero at first, which are put and looked at by slices."""
 Keep = Callable[[int, Callable[[], Volume]], Volume]
 """What gives the volume of the window of a number: as an earlier run left it, or as it is made."""
 
@@ -74,7 +72,7 @@ class Tiles:
     where: the kernels' file, for messages.
     device: of their map.
     like: (plane, row, column) before all lenslets, as volume_of takes it; may stay in a file.
-    room: for the volume, plane by plane, that windows are joined to.
+    room: for the volume, plane by plane, that windows are joined to; zero at first.
     keep: of the volumes of several windows, an attribute; nothing is kept where it is not set.
 
     Windows overlap by the lenslets that a voxel's light reaches, and fade into each other there.

@@ -252,7 +252,7 @@ def _field(
 
 def _write(task: _Task, job: _Job, output: Path | str) -> PifSummary:
     """Compute one matrix into its file."""
-    from plenocli.base.budget import budget, one_thread, within
+    from plenocli.base.budget import on_threads, one_thread
     from plenocli.files.artefacts import pif_pieces
     from plenocli.files.artefacts.writing import write_artefact
     from plenocli.forward.propagation.diagnosis import describe
@@ -266,7 +266,7 @@ def _write(task: _Task, job: _Job, output: Path | str) -> PifSummary:
         return _artefact(camera, task.settings, matrix, found, provenance)
 
     # the diagnosis too: its singular values must not depend on the cores of a machine
-    with one_thread(), within(replace(budget(), threads=task.workers)):
+    with one_thread(), on_threads(task.workers):
         chosen = pif_pieces.layout(plan, task.camera_path)
         _announce(camera, plan, pif_pieces.cost(plan)[1], task)
         with bar(None, total=plan.shape[0] * plan.shape[3], label="columns of A") as shown:

@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from plenocli.base.budget import budget, spread, within
+from plenocli.base.budget import on_threads, spread
 from plenocli.base.device import device
 from plenocli.forward.camera.quadrature import gauss, nodes_for
 from plenocli.forward.propagation.exact.debye import spherical_field
@@ -237,7 +237,7 @@ class ExactSquareLenslets(LensletFields):
         def join(lit: _Lit) -> None:
             self._tables[lit.at], products[lit.at] = self._joined(lit)
 
-        with within(replace(budget(), threads=plan.at_once)):
+        with on_threads(plan.at_once):
             self._meet_all(largest_first)
             for start in range(0, len(largest_first), plan.at_once):
                 some = [self._lit(*at) for at in largest_first[start : start + plan.at_once]]

@@ -17,10 +17,9 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from plenocli.base.budget import spread
 from plenocli.base.device import CPU, Device, beside, namespace
 from plenocli.base.errors import NumericsError
-from plenocli.base.tiling import bands
+from plenocli.base.tiling import spread_bands
 from plenocli.forward.propagation.complex_products import THREE_SERVE, product_of_thirds, thirds
 from plenocli.forward.propagation.fresnel.spread_function import terms_within
 
@@ -309,7 +308,7 @@ def _product(x: Any, y: Any) -> Any:
             thirds(part), parts, places.own[:, : len(part)]
         )
 
-    spread([(rows,) for rows in bands(len(x), ROWS)], work)
+    spread_bands(len(x), ROWS, work)
     return out
 
 

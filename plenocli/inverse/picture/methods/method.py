@@ -12,7 +12,7 @@ import numpy as np
 
 from plenocli.base.progress import note
 from plenocli.inverse.picture.estimators import Estimators, root_mean_square
-from plenocli.inverse.picture.footprint import Phases
+from plenocli.inverse.picture.footprint import Phases, cleaned
 from plenocli.inverse.picture.joint import JointEstimate, estimate_jointly
 from plenocli.inverse.picture.lenslet_model import Superpixels
 from plenocli.inverse.picture.reconstruction import (
@@ -108,6 +108,11 @@ class Method(ABC):
     weighs_all: bool = False
     points_around: int = 0
     unrestrained: bool = False
+
+    @property
+    def all_phases(self) -> Phases:
+        """Its memory, that of what rids captures of their nuisances before included."""
+        return self.phases if self.sees is Sees.LENSLET_AS_IS else cleaned(self.phases)
 
     @property
     def in_threads(self) -> bool:

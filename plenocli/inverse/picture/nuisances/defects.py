@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from plenocli.base.budget import spread
+from plenocli.base.tiling import spread_bands
 from plenocli.inverse.picture.lenslet_model import Common, alone
-from plenocli.inverse.picture.nuisances.pixel_model import PixelModel, chunks
+from plenocli.inverse.picture.nuisances.pixel_model import CHUNK, PixelModel
 
 FAR = 7.0
 """Standard deviations from which on a pixel is defective."""
@@ -95,7 +95,7 @@ class Spread:
             of_part = np.abs(deviation(model, y[:, some[part]]))
             far[:, part] = of_part / by_lenslet(of_part)
 
-        spread([(part,) for part in chunks(len(some))], look)
+        spread_bands(len(some), CHUNK, look)
         middle = NORMAL * np.median(far, axis=1).reshape(shape)
         # as scipy's median_filter, which takes longer to import than all else here
         around = sliding_window_view(np.pad(middle, AROUND // 2, mode="edge"), (AROUND, AROUND))
@@ -145,7 +145,7 @@ def find_defects(
             model, usual, y[:, part], clean[:, part], unknown[:, part]
         )
 
-    spread([(part,) for part in chunks(y.shape[1])], look)
+    spread_bands(y.shape[1], CHUNK, look)
     return sign, clean
 
 

@@ -13,7 +13,6 @@ off it (docs/model.md, "Spatial reconstruction").
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -271,8 +270,3 @@ class Open:
             inverse = solve_triangular(self.factor, np.eye(len(self.root)), lower=True)
             return np.sum(inverse**2, axis=0)
         return 1 + np.sum(solve_triangular(self.factor, self.root.T, lower=True) ** 2, axis=0)
-
-
-def chunks(count: int) -> Iterator[slice]:
-    """Slices of CHUNK out of `count`."""
-    return (slice(first, first + CHUNK) for first in range(0, count, CHUNK))

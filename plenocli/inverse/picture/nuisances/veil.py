@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from plenocli.base.budget import spread
+from plenocli.base.tiling import spread_bands
 from plenocli.inverse.picture.lenslet_model import Common, alone
 from plenocli.inverse.picture.nuisances.defects import NORMAL, by_lenslet
-from plenocli.inverse.picture.nuisances.pixel_model import PixelModel, chunks
+from plenocli.inverse.picture.nuisances.pixel_model import CHUNK, PixelModel
 
 SURE = 4.0
 """Standard deviations from which on a veil is said to be there."""
@@ -177,7 +177,7 @@ def _offsets(model: PixelModel, y: np.ndarray) -> _Offsets:
         misfit[part] = by_lenslet(np.abs(rest.value) / (model.sigma * np.sqrt(rest.open)))
         brightness[part] = even @ y[:, part] / (even @ even)
 
-    spread([(part,) for part in chunks(y.shape[1])], look)
+    spread_bands(y.shape[1], CHUNK, look)
     return _Offsets(value, variance, brightness, misfit)
 
 

@@ -4,10 +4,12 @@ that the matrix predicts.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+
+from plenocli.base.tiling import Room
 
 SEEN = 0.1
 """Of the brightest pixel of even light from which on the white of a pixel is compared with it."""
@@ -25,8 +27,6 @@ STEEPEST = 4.0
 """Factor beyond which no pixel is brightened or darkened."""
 LEAST = 16
 """Pixels that are looked at together, at least."""
-Room = Callable[[tuple[int, ...], np.dtype], Any]
-"""What gives room for values of a shape and dtype, put and looked at by slices."""
 
 
 def falloff(white: np.ndarray, even: np.ndarray, shape: tuple[int, int]) -> np.ndarray:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from plenocli.base.budget import budget, within
+from plenocli.base.budget import on_threads
 from plenocli.base.errors import PlenoError
 from plenocli.base.progress import bar, collected_notes, note
 from plenocli.execution.pool import Pool, run_all
@@ -21,7 +21,7 @@ from plenocli.files.read.captures import superpixel_source
 from plenocli.inverse.picture.diagnosis import Seen
 from plenocli.inverse.picture.estimate import estimate
 from plenocli.inverse.picture.estimators import Estimators
-from plenocli.inverse.picture.footprint import cleaned, pieces_at_once, require_reconstruction
+from plenocli.inverse.picture.footprint import pieces_at_once, require_reconstruction
 from plenocli.inverse.picture.lenslet_model import Superpixels, Whole
 from plenocli.inverse.picture.methods.method import Sees
 from plenocli.inverse.picture.methods.registry import METHODS
@@ -56,7 +56,7 @@ def picture_in_tiles(
     """The picture of a capture that is larger than a tile."""
     settings, system = recipe.settings, estimators_of(recipe).system
     # what comes before there are tiles is worked out by as many threads
-    with within(replace(budget(), threads=settings.workers)):
+    with on_threads(settings.workers):
         typical = _Typical.of(recipe, capture, source, tiles, target)
     sample, task = typical.found, typical.task
     all_weigh = METHODS[sample.method].weighs_all  # of the one that auto took
@@ -85,11 +85,10 @@ def picture_in_tiles(
 def tiles_at_once(recipe: Recipe) -> int:
     """How many of its workers, threads of this process, the memory holds with a tile each."""
     estimators, method = estimators_of(recipe), METHODS[recipe.settings.method]
-    look = method.sees is not Sees.LENSLET_AS_IS
     return pieces_at_once(
         estimators,
         largest_tile(estimators, method),
-        cleaned(method.phases) if look else method.phases,
+        method.all_phases,
         joint=method.makes_joint_estimate(estimators),
         most=recipe.settings.workers,
     )
@@ -128,7 +127,7 @@ class _Typical:
             most,
             data.sigma,
             capture,
-            cleaned(method.phases) if look else method.phases,
+            method.all_phases,
             joint=method.makes_joint_estimate(estimators),
         )
         limits, finer = limits_of(estimators, data), False

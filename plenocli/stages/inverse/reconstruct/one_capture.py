@@ -23,7 +23,7 @@ from plenocli.inverse.calibration.calibration import Windows, there
 from plenocli.inverse.picture.diagnosis import Seen
 from plenocli.inverse.picture.estimate import estimate
 from plenocli.inverse.picture.estimators import Estimators
-from plenocli.inverse.picture.footprint import cleaned, require_reconstruction
+from plenocli.inverse.picture.footprint import require_reconstruction
 from plenocli.inverse.picture.lenslet_model import Superpixels
 from plenocli.inverse.picture.methods.method import Method, Sees
 from plenocli.inverse.picture.methods.registry import METHODS
@@ -93,7 +93,7 @@ def reconstruct_capture(
         data.y.shape[0] * data.y.shape[1],
         data.sigma,
         capture,
-        cleaned(method.phases) if look else method.phases,
+        method.all_phases,
         joint=method.makes_joint_estimate(estimators),
     )
     count = data.y.shape[:2]

@@ -5,17 +5,17 @@ neighbours.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from plenocli.base.budget import budget, within
+from plenocli.base.budget import on_threads
 from plenocli.base.errors import UsageError
 from plenocli.execution.batch import BatchSummary, outcomes, plan_batch, summarise
 from plenocli.execution.pool import InProcess, open_pool
 from plenocli.files.read.captures import (
     describe_capture,
+    forget_captures,
     named_captures,
 )
 from plenocli.files.read.training import files_of
@@ -83,7 +83,7 @@ def run_reconstruct(
     def write(solved: Solved, capture: Path, target: Path) -> PictureSummary:
         inputs = _inputs(settings, capture, pif, calibration)
         # of a single one nothing is estimated any more
-        with within(replace(budget(), threads=settings.workers if split else 1)):
+        with on_threads(settings.workers if split else 1):
             return write_picture(target, solved, settings, command, inputs, overwrite)
 
     try:
@@ -106,6 +106,7 @@ def run_reconstruct(
         estimators_of.cache_clear()
         finer_of.cache_clear()
         field_of.cache_clear()
+        forget_captures()
 
 
 def _summary(done: BatchSummary) -> ReconstructSummary:

@@ -10,18 +10,24 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextvars import copy_context
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from plenocli.base.errors import InputError, NumericsError
 from plenocli.base.memory import size_text
 
 if TYPE_CHECKING:
+    from concurrent.futures import Future
+
     from threadpoolctl import ThreadpoolController
+
+T = TypeVar("T")
+U = TypeVar("U")
 
 EXPANSION = 1 << 15
 """Times its own size that a whole file can declare: deflate packs 1032 bytes into one, and a pixel
@@ -182,3 +188,33 @@ def spread(parts: Sequence[tuple], work: Callable[..., object]) -> None:
             # each in what is set where it is asked for: whoever collects notes gets theirs
             for done in [pool.submit(copy_context().run, work, *part) for part in parts]:
                 done.result()
+
+
+def both(one: Callable[[], T], other: Callable[[], U]) -> tuple[T, U]:
+    """What two functions give, at the same time where the budget has threads."""
+    found: dict[int, Any] = {}
+
+    def make(number: int, work: Callable[[], Any]) -> None:
+        found[number] = work()
+
+    spread([(0, one), (1, other)], make)
+    return found[0], found[1]
+
+
+def ahead(items: Iterable[T]) -> Iterator[T]:
+    """The same items; each is made while the one before is used, where the budget has threads."""
+    if budget().threads <= 1:
+        yield from items
+        return
+    from concurrent.futures import ThreadPoolExecutor
+
+    coming = iter(items)
+    with ThreadPoolExecutor(1) as pool:
+
+        def begun() -> Future[list[T]]:
+            return pool.submit(copy_context().run, lambda: list(islice(coming, 1)))
+
+        item = begun()
+        while found := item.result():
+            item = begun()
+            yield found[0]

@@ -27,7 +27,7 @@ def file():
 def test_hdf5_unpacks_what_was_packed(file, kind, shape, sides):
     values = np.random.default_rng(3).integers(0, 200, shape).astype(kind)
     made = file.create_dataset("a", shape, kind, chunks=sides, **FILTERS)
-    write_chunks(made, (0,) * len(shape), values)
+    write_chunks(made, [((0,) * len(shape), values)])
     assert np.array_equal(made[()], values)
     made.id.write_direct_chunk(
         (0,) * len(shape), _flipped(made.id.read_direct_chunk((0,) * len(shape))[1])
@@ -45,7 +45,7 @@ def test_bytes_before_deflate_are_those_of_hdf5(file):
     values = np.random.default_rng(4).normal(size=(10, 9))
     for name in ("ours", "hdf5"):
         file.create_dataset(name, values.shape, "f8", chunks=(4, 6), **FILTERS)
-    write_chunks(file["ours"], (0, 0), values)
+    write_chunks(file["ours"], [((0, 0), values)])
     file["hdf5"][:] = values
     for corner in [(0, 0), (8, 6), (4, 6)]:
         found = [file[name].id.read_direct_chunk(corner) for name in ("ours", "hdf5")]

@@ -238,28 +238,27 @@ def _write_array(file, path, values):
         file.create_dataset(path, data=values, **storage)
     else:
         made = file.create_dataset(path, shape=values.shape, dtype=values.dtype, **storage)
-        write_chunks(made, (0,) * values.ndim, values)
+        write_chunks(made, [((0,) * values.ndim, values)])
 
 
 def _write_parts(file, schema, path, values):
     """Write a dataset part by part, whole chunks at a time."""
+    made = file.create_dataset(path, shape=values.shape, dtype=values.dtype, **_storage(values))
+    write_chunks(made, _blocks(replace(schema, rules=()), path, values, made.chunks))
+
+
+def _blocks(schema, path, values, chunks):
+    """The parts of a dataset put together to blocks of whole chunks, as write_chunks takes them;
+    ValueError where the table forbids values.
+    """
     shape = values.shape
-    made = file.create_dataset(path, shape=shape, dtype=values.dtype, **_storage(values))
     # chunks are parts of axis `axis`, whole beyond it and one index thick before it
-    axis = next((k for k, side in enumerate(made.chunks[:-2]) if side > 1), len(shape) - 2)
+    axis = next((k for k, side in enumerate(chunks[:-2]) if side > 1), len(shape) - 2)
     inner = math.prod(shape[axis + 1 : -1])
-    rows, step, at, held = shape[axis] * inner, made.chunks[axis] * inner, 0, []
-    fields = replace(schema, rules=())
-
-    def put(block):
-        before, row = divmod(at, rows)
-        corner = *np.unravel_index(before, shape[:axis]), row // inner
-        block = block.reshape((1,) * axis + (-1,) + shape[axis + 1 :])
-        write_chunks(made, corner + (0,) * (len(shape) - axis - 1), block)
-
+    rows, step, at, held = shape[axis] * inner, chunks[axis] * inner, 0, []
     for part in values.parts():
         part = np.ascontiguousarray(part, values.dtype)
-        problems = tables.value_problems(fields, {path: part})
+        problems = tables.value_problems(schema, {path: part})
         if problems:
             raise ValueError("; ".join(problems))
         held.append(part)
@@ -268,7 +267,10 @@ def _write_parts(file, schema, path, values):
         ready = waiting if end % rows == 0 else end % rows // step * step - at % rows
         if ready >= AT_ONCE * step or (ready > 0 and end % rows == 0):
             block = held[0] if len(held) == 1 else np.concatenate(held)
-            put(block[:ready])
+            before, row = divmod(at, rows)
+            corner = *np.unravel_index(before, shape[:axis]), row // inner
+            placed = block[:ready].reshape((1,) * axis + (-1,) + shape[axis + 1 :])
+            yield corner + (0,) * (len(shape) - axis - 1), placed
             at, held = at + ready, [block[ready:]] if ready < waiting else []
     if at != np.prod(shape[:-1]):
         raise ValueError(f"'{path}' lacks rows")

@@ -116,9 +116,9 @@ class StoredCapture:
         return rows, columns
 
     @property
-    def itemsize(self) -> int:
-        """Bytes of a value."""
-        return self.about.mosaic.dtype.itemsize
+    def dtype(self) -> np.dtype:
+        """Of a value."""
+        return self.about.mosaic.dtype
 
     def values(self, rows: slice, columns: slice = EVERYTHING) -> np.ndarray:
         """A part of the mosaic as it is stored. Raises InputError."""

@@ -5,7 +5,9 @@ system matrix.
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Iterable, Iterator
+from concurrent.futures import Future
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -15,9 +17,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from plenocli.base.budget import budget
+from plenocli.base.budget import budget, spread
 from plenocli.base.errors import InputError
 from plenocli.base.progress import collected_notes
+from plenocli.base.tiling import bands
 from plenocli.files.artefacts.provenance import require_file
 from plenocli.files.images.in_bands import SHARE
 from plenocli.files.images.mosaic import (
@@ -35,6 +38,8 @@ from plenocli.inverse.picture.tiles import EVERY, Area, Source
 if TYPE_CHECKING:
     from plenocli.forward.sensor.capture import Capture
 
+PART = 1 << 24
+"""Bytes of rows that are read at a time."""
 KEPT_SHARE = 1 / 64
 """Share of the memory that the last rows of a capture may take."""
 SUFFIXES = tuple(
@@ -137,6 +142,38 @@ class _Held:
         return self.data.cut(rows, columns, own)
 
 
+class _Rows:
+    """Rows of a stored capture, of which each thread that waits for them reads a part."""
+
+    def __init__(self, capture: StoredCapture, rows: slice) -> None:
+        self.rows, self._capture = rows, capture
+        self._values = np.empty((rows.stop - rows.start, capture.shape[1]), capture.dtype)
+        most = PART // (capture.shape[1] * capture.dtype.itemsize)
+        self._parts = [(part, Future[None]()) for part in bands(len(self._values), most)]
+        self._left = deque(self._parts)
+
+    def values(self) -> np.ndarray:
+        """Of all columns, not to be written to. Raises InputError."""
+        spread([()] * len(self._left), self._read_next)
+        for _, done in self._parts:
+            done.result()
+        found = self._values.view()
+        found.flags.writeable = False
+        return found
+
+    def _read_next(self) -> None:
+        try:
+            part, done = self._left.popleft()
+        except IndexError:  # another was faster
+            return
+        rows = slice(self.rows.start + part.start, self.rows.start + part.stop)
+        try:
+            self._values[part] = self._capture.values(rows)
+            done.set_result(None)
+        except BaseException as error:
+            done.set_exception(error)
+
+
 class _Windows:
     """Windows of a stored capture. Chunks of its file, if it has any, are as wide as the sensor, so
     that tiles side by side would unpack the same ones: the last rows are kept where they are few.
@@ -144,23 +181,21 @@ class _Windows:
 
     def __init__(self, capture: StoredCapture) -> None:
         self.capture = capture
-        self._rows: tuple[slice, np.ndarray] | None = None
-        # threads read in turn: those that work meanwhile need no decoder of their own
+        self._last: _Rows | None = None
         self._turn = Lock()
 
     def read(self, rows: slice, columns: slice) -> Capture:
         """That of some pixels. Raises InputError."""
-        size = (rows.stop - rows.start) * self.capture.shape[1] * self.capture.itemsize
+        capture = self.capture
+        size = (rows.stop - rows.start) * capture.shape[1] * capture.dtype.itemsize
+        if size > KEPT_SHARE * budget().memory:
+            return capture.window(rows, columns)
         with self._turn:
-            if size > KEPT_SHARE * budget().memory:
-                return self.capture.window(rows, columns)
-            if self._rows is None or self._rows[0] != rows:
-                self._rows = None  # not two at a time
-                values = self.capture.values(rows).view()
-                values.flags.writeable = False
-                self._rows = rows, values
-            values = self._rows[1]
-        return self.capture.holding(values[:, columns], rows, columns)
+            if self._last is None or self._last.rows != rows:
+                self._last = None  # not two at a time
+                self._last = _Rows(capture, rows)
+            last = self._last
+        return capture.holding(last.values()[:, columns], rows, columns)
 
 
 class _Stored:

@@ -337,7 +337,7 @@ def test_a_pitch_that_is_off_breaks_the_picture_by_even_light_that_it_displaces(
     pitch = captured(matrix(*DISTURBED["pitch"]))
     assert made("lmmse", pitch).as_json()["continuity"] > 0.9
     assert made("lmmse", captured(matrix(*DISTURBED["focus"]))).as_json()["continuity"] < 0.1
-    monkeypatch.setattr(believe, "_displaced", lambda *_: (None, 0.0))
+    monkeypatch.setattr(believe, "moved_even_light", lambda *_: (None, 0.0))
     assert made("lmmse", pitch).as_json()["continuity"] < 0.6
 
 

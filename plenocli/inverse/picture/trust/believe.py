@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from plenocli.base.budget import both
 from plenocli.base.random_streams import stream
 from plenocli.inverse.picture.estimators import Estimators, root_mean_square
 from plenocli.inverse.picture.solvers.least_squares import Svd
@@ -124,20 +125,25 @@ def believe(
     """
     lmmse = estimators.prior.lmmse(level.sigma, scene)
     stacked = y.reshape(-1, y.shape[-1]).T
-    judge = _Judge.of(estimators, lmmse, y, scene)
-    shown, even = (None, 0.0) if coupled else _displaced(judge, estimators, lmmse, stacked)
+    system, svd = estimators.system, estimators.svd
+    judge, (shown, even) = both(
+        lambda: _Judge.of(estimators, lmmse, y, scene),
+        lambda: (None, 0.0) if coupled else moved_even_light(system, lmmse, stacked),
+    )
+    shown = _displaced(judge, lmmse, shown, even)
     displaced = 0.0 if shown is None else even
     if judge is not None and shown is not None:
         y = without_pattern(lmmse, y, shown)
         stacked, judge = y.reshape(-1, y.shape[-1]).T, replace(judge, y=y)
-    first = None if judge is None else judge.of_lmmse(lmmse)
+    first, moved = both(
+        lambda: None if judge is None else judge.of_lmmse(lmmse),
+        lambda: 0.0 if coupled else moved_light(system, svd, lmmse, stacked, level.sigma),
+    )
     beyond = (
         -np.inf if level.found is None else level.found / level.sigma - (MISFIT if coupled else 1)
     )
-    chance = 1 / np.sqrt(2 * max(dark(estimators.svd) * stacked.shape[1], 1))
+    chance = 1 / np.sqrt(2 * max(dark(svd) * stacked.shape[1], 1))
     found = beyond > MISTOLD + SURE * chance or model_error * root_mean_square(y) > level.sigma
-    system, svd = estimators.system, estimators.svd
-    moved = 0.0 if coupled else moved_light(system, svd, lmmse, stacked, level.sigma)
     found = found or moved > MOVED
     quiet = beyond <= HINT * chance and not displaced
     allowed = ALLOWED * float(np.clip(1 - moved / HINT, 0, 2)) if quiet else 0.0
@@ -277,13 +283,14 @@ class _Judge:
 
 
 def _displaced(
-    judge: _Judge | None, estimators: Estimators, lmmse: Lmmse, y: np.ndarray
-) -> tuple[np.ndarray | None, float]:
-    """Even light that moved, as `moved_even_light`; None where it may be a continuous scene's."""
-    shown, deviations = moved_even_light(estimators.system, lmmse, y)
-    if judge is None or deviations <= SURE or judge.goes_on(lmmse, shown) >= CONTINUOUS:
-        return None, deviations
-    return shown, deviations
+    judge: _Judge | None, lmmse: Lmmse, shown: np.ndarray | None, deviations: float
+) -> np.ndarray | None:
+    """Even light that moved, as `moved_even_light` has it; None where it may be a continuous
+    scene's.
+    """
+    if judge is None or shown is None or deviations <= SURE:
+        return None
+    return None if judge.goes_on(lmmse, shown) >= CONTINUOUS else shown
 
 
 def _scene_jumps(

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from plenocli.base.budget import both
 from plenocli.inverse.picture.lenslet_model import LensletMatrix
 from plenocli.inverse.picture.solvers.least_squares import Svd
 from plenocli.inverse.picture.solvers.lmmse import Lmmse, mean_scale
@@ -53,8 +54,9 @@ def moved_light(
     if min(*system.pixel_shape, *system.object_shape) < 2:
         return 0.0
     y = y[:, :: -(-y.shape[1] // LOOKED_AT)]
-    slopes, chance = _beyond(system, svd, lmmse, y, sigma)
-    more, unusual = _within(system, lmmse, y, svd)
+    (slopes, chance), (more, unusual) = both(
+        lambda: _beyond(system, svd, lmmse, y, sigma), lambda: _within(system, lmmse, y, svd)
+    )
     return max(_deviations(slopes, chance), _deviations(slopes + more, chance + unusual))
 
 

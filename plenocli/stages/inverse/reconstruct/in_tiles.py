@@ -11,13 +11,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from plenocli.base.budget import on_threads
+from plenocli.base.budget import both, on_threads
 from plenocli.base.errors import PlenoError
 from plenocli.base.progress import bar, collected_notes, note
 from plenocli.execution.pool import Pool, run_all
 from plenocli.files.artefacts.provenance import file_digest
 from plenocli.files.bench import Bench
-from plenocli.files.read.captures import superpixel_source
+from plenocli.files.outside import ready
+from plenocli.files.read.captures import describe_capture, superpixel_source
 from plenocli.inverse.picture.diagnosis import Seen
 from plenocli.inverse.picture.estimate import estimate
 from plenocli.inverse.picture.estimators import Estimators
@@ -57,11 +58,12 @@ def picture_in_tiles(
     settings, system = recipe.settings, estimators_of(recipe).system
     # what comes before there are tiles is worked out by as many threads
     with on_threads(settings.workers):
+        ready(settings.workers)
         typical = _Typical.of(recipe, capture, source, tiles, target)
     sample, task = typical.found, typical.task
     all_weigh = METHODS[sample.method].weighs_all  # of the one that auto took
     task = task.sharing(pool, tiles if all_weigh else spread_over(source.count, side_of(system)))
-    depends = replace(settings, workers=1), recipe.digests, file_digest(capture), tiles
+    depends = replace(settings, workers=1), recipe.digests, typical.capture, tiles
     bench = Bench.beside(target, depends)
     clip = partial(np.maximum, 0) if settings.clip else np.asarray
     stats = solve_all(pool, task, tiles, bench, clip)
@@ -74,6 +76,7 @@ def picture_in_tiles(
             note(entry.sentence)
     return Solved(
         found=replace(sample, trace=trace, **parts),
+        capture=typical.capture,
         seen=typical.seen,
         limits=typical.limits,
         negative_share=float(counted[0]) / np.prod(value.shape),
@@ -99,6 +102,7 @@ class _Typical:
     """What the square that is most like a capture tells of it.
 
     found: of the square.
+    capture: as in Solved.
     seen: of its objects.
     limits: whether noise or the matrix decides.
     declared: whether the capture says where its sensor saturates.
@@ -106,6 +110,7 @@ class _Typical:
     """
 
     found: Reconstruction
+    capture: dict[str, Any]
     seen: Seen | None
     limits: Limits | None
     declared: bool
@@ -119,7 +124,14 @@ class _Typical:
         estimators = estimators_of(recipe)
         method, system = METHODS[recipe.settings.method], estimators.system
         look = method.sees is not Sees.LENSLET_AS_IS
-        whole, middle = survey(system, source, side_of(system))
+
+        def described() -> dict[str, Any]:
+            if look:  # what all that follows needs is made while the survey waits for the file
+                estimators.prior.pictures(source.cut(slice(0, 1), slice(0, 1)).scene)
+                estimators.svd  # noqa: B018
+            return describe_capture(capture)
+
+        (whole, middle), about = both(lambda: survey(system, source, side_of(system)), described)
         data = source.cut(*middle.own)
         most = max(math.prod(part.stop - part.start for part in tile.around) for tile in tiles)
         require_reconstruction(
@@ -147,7 +159,9 @@ class _Typical:
             model_error=off,
             whole=whole,
         )
-        return cls(found=found, seen=seen, limits=limits, declared=declared, task=task)
+        return cls(
+            found=found, capture=about, seen=seen, limits=limits, declared=declared, task=task
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

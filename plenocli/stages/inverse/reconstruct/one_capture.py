@@ -15,7 +15,7 @@ from plenocli.base.progress import note
 from plenocli.base.tiling import Plane, bands, to_blocks
 from plenocli.execution.pool import InProcess, Pool
 from plenocli.files.read.calibrations import read_white
-from plenocli.files.read.captures import room_beside, superpixel_source
+from plenocli.files.read.captures import describe_capture, room_beside, superpixel_source
 from plenocli.files.read.system_matrices import FieldMatrix
 from plenocli.forward.sensor.cfa import cfa_map
 from plenocli.forward.sensor.superpixel import extract_rows
@@ -76,7 +76,7 @@ def reconstruct_capture(
         choice = Choice(method="block-mean", reason="sum over the superpixel, over that of white")
         value, rgb = _white_normalised(capture, recipe.calibration, where)
         found = Reconstruction(value=value, method=choice.method, trace=(choice,))
-        return _solved(found, settings, rgb=rgb)
+        return _solved(found, settings, capture, rgb=rgb)
     estimators, method = estimators_of(recipe), METHODS[settings.method]
     system = estimators.system
     with superpixel_source(
@@ -117,6 +117,7 @@ def reconstruct_capture(
     return _solved(
         found.as_picture(system.object_shape),
         settings,
+        capture,
         seen=seen,
         limits=limits,
         block=system.object_shape,
@@ -149,9 +150,10 @@ def _estimate(
     )
 
 
-def _solved(found: Reconstruction, settings: Settings, **more: Any) -> Solved:
+def _solved(found: Reconstruction, settings: Settings, capture: Path, **more: Any) -> Solved:
     picture = found.value
     return Solved(
+        capture=describe_capture(capture),
         found=replace(found, value=np.maximum(picture, 0) if settings.clip else picture),
         negative_share=float(np.mean(picture < 0)),
         **more,

@@ -13,11 +13,7 @@ from plenocli.base.budget import on_threads
 from plenocli.base.errors import UsageError
 from plenocli.execution.batch import BatchSummary, outcomes, plan_batch, summarise
 from plenocli.execution.pool import InProcess, open_pool
-from plenocli.files.read.captures import (
-    describe_capture,
-    forget_captures,
-    named_captures,
-)
+from plenocli.files.read.captures import forget_captures, named_captures
 from plenocli.files.read.training import files_of
 from plenocli.inverse.picture.methods.registry import METHODS, takers
 from plenocli.stages.inverse.reconstruct.in_tiles import tiles_at_once
@@ -81,7 +77,7 @@ def run_reconstruct(
     recipe = recipe_of(settings, pif, calibration, pooled, elsewhere=scheduler is not None)
 
     def write(solved: Solved, capture: Path, target: Path) -> PictureSummary:
-        inputs = _inputs(settings, capture, pif, calibration)
+        inputs = solved.capture | _inputs(settings, pif, calibration)
         # of a single one nothing is estimated any more
         with on_threads(settings.workers if split else 1):
             return write_picture(target, solved, settings, command, inputs, overwrite)
@@ -154,13 +150,11 @@ def _check_options(settings: Settings, pif: Path | None, calibration: Path | Non
             )
 
 
-def _inputs(
-    settings: Settings, capture: Path, pif: Path | None, calibration: Path | None
-) -> dict[str, Any]:
-    """The files that a picture was made from, for its provenance."""
+def _inputs(settings: Settings, pif: Path | None, calibration: Path | None) -> dict[str, Any]:
+    """The files that a picture was made from beside its capture, for its provenance."""
     from plenocli.files.artefacts.provenance import describe_inputs
 
-    return describe_capture(capture) | describe_inputs(
+    return describe_inputs(
         {
             "pif": pif,
             "calibration": calibration,

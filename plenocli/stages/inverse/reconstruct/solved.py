@@ -20,6 +20,7 @@ class Solved:
     """The picture of a capture.
 
     found: its value (row, column) or (band, row, column).
+    capture: what it was made from, as describe_capture has it.
     seen: what of an object the sensor tells apart, None where the noise is not known.
     limits: what limits it, None where that is not known.
     negative_share: of the values, before they are clipped.
@@ -29,6 +30,7 @@ class Solved:
     """
 
     found: Reconstruction
+    capture: dict[str, Any]
     seen: Seen | None = None
     limits: Limits | None = None
     negative_share: float

@@ -95,18 +95,6 @@ def outside_in_parts(
     _value(answer, path, ask)
 
 
-def ready(count: int) -> None:
-    """Have children for `count` threads that decode at the same time, as long as this process can
-    be copied: once it has threads each starts anew, which takes a quarter of a second.
-    """
-    children: list[_Child] = []
-    with contextlib.suppress(PlenoError):
-        while len(children) < count and _may_fork():
-            children.append(_taken()[0])
-    with _lock:
-        _idle.extend(children)
-
-
 def _asked(
     function: Callable[..., Any],
     path: str | os.PathLike,

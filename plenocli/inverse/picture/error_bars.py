@@ -13,6 +13,7 @@ from statistics import NormalDist
 
 import numpy as np
 
+from plenocli.base.budget import both
 from plenocli.base.tiling import to_plane
 from plenocli.inverse.picture.estimators import Estimators
 from plenocli.inverse.picture.lenslet_model import Common, Superpixels
@@ -78,12 +79,15 @@ def posterior(
     scale = mean_scale(contrast)
     x, sigma = (
         found.T.reshape(rows, columns, -1)
-        for found in (lmmse.apply(signals, scale, w), spread(lmmse, w, contrast))
+        for found in both(
+            lambda: lmmse.apply(signals, scale, w), lambda: spread(lmmse, w, contrast)
+        )
     )
 
     def wider() -> float:
-        border = disagreement(x, sigma, shape)
-        weak = weak_power(lmmse, w, scale)
+        border, weak = both(
+            lambda: disagreement(x, sigma, shape), lambda: weak_power(lmmse, w, scale)
+        )
         return float(np.exp(BY_WEAK * weak + BY_BORDER * (border - USUAL_BORDER)))
 
     return x, sigma * common("wider", wider, (lmmse.sigma, float(lmmse.noise.sum())))

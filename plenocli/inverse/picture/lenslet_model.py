@@ -82,7 +82,12 @@ class LensletMatrix:
         """Brightness of each band, (.., band), behind superpixels y (.., pixel), by least squares
         on `even`.
         """
-        return y @ np.linalg.pinv(self.even, rcond=1e-3).T
+        return y @ self._to_levels
+
+    @cached_property
+    def _to_levels(self) -> np.ndarray:
+        """(pixel, band)."""
+        return np.linalg.pinv(self.even, rcond=1e-3).T
 
 
 def gathered(matrices: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:

@@ -133,11 +133,13 @@ def survey(system: LensletMatrix, source: Source, tile: int) -> tuple[Whole, Til
     levels, detail, power = np.zeros(count), np.zeros(count), np.zeros(count)
 
     def look(rows: slice) -> None:
-        y = source.cut(rows, slice(0, count[1])).y
-        y = np.where(np.isfinite(y), y, 0)
-        found = system.levels(y)
-        levels[rows], power[rows] = found.mean(axis=2), np.mean(found**2, axis=2)
-        detail[rows] = np.sqrt(np.mean((y - found @ system.even.T) ** 2, axis=2))
+        # row by row: what is worked on stays in the cache
+        for row, y in enumerate(source.cut(rows, slice(0, count[1])).y, start=rows.start):
+            y = np.where(np.isfinite(y), y, 0)
+            found = system.levels(y)
+            levels[row], power[row] = found.mean(axis=1), np.mean(found**2, axis=1)
+            y -= found @ system.even.T
+            detail[row] = np.sqrt(np.mean(np.square(y, out=y), axis=1))
 
     spread_bands(count[0], tile**2 // count[1], look)
     unit = math.sqrt(float(power.mean())) / BRIGHTNESS

@@ -17,7 +17,6 @@ from plenocli.base.progress import bar, collected_notes, note
 from plenocli.execution.pool import Pool, run_all
 from plenocli.files.artefacts.provenance import file_digest
 from plenocli.files.bench import Bench
-from plenocli.files.outside import ready
 from plenocli.files.read.captures import describe_capture, superpixel_source
 from plenocli.inverse.picture.diagnosis import Seen
 from plenocli.inverse.picture.estimate import estimate
@@ -58,7 +57,6 @@ def picture_in_tiles(
     settings, system = recipe.settings, estimators_of(recipe).system
     # what comes before there are tiles is worked out by as many threads
     with on_threads(settings.workers):
-        ready(settings.workers)
         typical = _Typical.of(recipe, capture, source, tiles, target)
     sample, task = typical.found, typical.task
     all_weigh = METHODS[sample.method].weighs_all  # of the one that auto took

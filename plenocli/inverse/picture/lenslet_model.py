@@ -242,6 +242,11 @@ class Superpixels:
         """What `work` gives; of a piece, what the whole has under this name."""
         return work() if self.whole is None else self.whole.value(name, work, which)
 
+    @property
+    def only_means(self) -> bool:
+        """Whether a piece is looked at for what it adds to means over pieces alone."""
+        return self.whole is not None and self.whole.only_means
+
     def cut(self, rows: slice, columns: slice, own: tuple[slice, slice]) -> Superpixels:
         """Those of some lenslets, of which `own` count."""
         saturated, variance = (

@@ -119,16 +119,22 @@ def block_mean(
 
 def _means(estimators: Estimators, y: np.ndarray) -> np.ndarray:
     """Means of the lenslets, at all points of a band alike, (point, signal)."""
+    return _even(estimators) @ estimators.system.levels(y.T).T
+
+
+def _even(estimators: Estimators) -> np.ndarray:
+    """Objects of brightness one in a band and none in the others, (point, band)."""
     system = estimators.system
-    return np.repeat(system.levels(y.T).T, int(np.prod(system.object_shape)), axis=0)
+    bands, points = max(1, len(system.bands)), int(np.prod(system.object_shape))
+    return np.repeat(np.eye(bands), points, axis=0)
 
 
 def _about_means(estimators: Estimators, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(means, z): means of the lenslets (point, signal), and what of y they leave, compressed, for
     estimates of the detail alone. Estimates of all of the light are drawn towards black.
     """
-    means = _means(estimators, y)
-    return means, estimators.svd.compress(y) - estimators.svd.shown(means)
+    svd, even, levels = estimators.svd, _even(estimators), estimators.system.levels(y.T).T
+    return even @ levels, svd.compress(y) - svd.shown(even) @ levels
 
 
 def tikhonov(
@@ -145,7 +151,7 @@ def tikhonov(
         power = light.data.common("power", lambda: least_squares.power_of(z[:, light.counted]))
         alpha = least_squares.discrepancy_alpha(svd, power, light.data.known_sigma)
         rule = "discrepancy"
-    found = means + least_squares.tikhonov(svd, z, alpha)
+    found = means if light.data.only_means else means + least_squares.tikhonov(svd, z, alpha)
     return found, TikhonovStats(alpha=float(alpha), rule=rule)
 
 
@@ -164,7 +170,7 @@ def tsvd(
         rank = least_squares.best_rank(svd, power, light.data.known_sigma)
         rule = "least estimated error"
     rank = min(rank, svd.rank())
-    found = means + least_squares.truncated(svd, z, rank)
+    found = means if light.data.only_means else means + least_squares.truncated(svd, z, rank)
     return found, TsvdStats(rank=int(rank), rule=rule)
 
 

@@ -117,7 +117,7 @@ def _from_lmmse(
     counted = sigma[inner].reshape(-1, sigma.shape[2])[light.counted]
     error = float(np.sqrt(light.data.common("start", lambda: np.mean(counted**2))))
     found, rule, rounds = x.copy(), "", 0
-    if not (light.data.whole and light.data.whole.only_means):
+    if not light.data.only_means:
         reach, held = -(-LOOK // min(shape)), None
         own = (part.indices(n) for part, n in zip(light.data.own, y.shape))
         near = tuple(slice(max(0, first - reach), last + reach) for first, last, _ in own)

@@ -102,18 +102,21 @@ def partial_path(path: str | os.PathLike) -> Path:
     return path.with_name(f".{path.name}.partial")
 
 
-def publish(path: str | os.PathLike, data: Any, *, overwrite: bool = False) -> None:
+def publish(
+    path: str | os.PathLike, data: Any, *, overwrite: bool = False, for_good: bool = True
+) -> None:
     """Put bytes into a file so that a reader sees all of them or the file as it was.
 
     path: file to write.
     data: bytes, or a list of bytes-like pieces.
     overwrite: whether the file may exist.
+    for_good: as of `replacement`.
 
     Raises UsageError if the file exists and `overwrite` is not set, OutputError if it cannot be
     written; the target is then untouched and nothing is left beside it.
     """
     pieces = [data] if isinstance(data, (bytes, bytearray, memoryview)) else data
-    with replacement(path, overwrite=overwrite) as (_, descriptor):
+    with replacement(path, overwrite=overwrite, for_good=for_good) as (_, descriptor):
         for piece in pieces:
             _write_all(descriptor, memoryview(piece).cast("B"))
 
@@ -126,6 +129,7 @@ class _Staged:
     target: where it will stand, links followed.
     partial, descriptor: where it is, open and locked.
     overwrite: whether the target may exist.
+    for_good: as of `replacement`.
     """
 
     path: Path
@@ -133,6 +137,7 @@ class _Staged:
     partial: Path
     descriptor: int
     overwrite: bool
+    for_good: bool
 
     def discard(self) -> None:
         """Let go of the temporary file; it is removed where it has not taken its place."""
@@ -171,22 +176,27 @@ def together() -> Iterator[list[_Staged]]:
 
 
 @contextlib.contextmanager
-def replacement(path: str | os.PathLike, *, overwrite: bool = False) -> Iterator[tuple[Path, int]]:
+def replacement(
+    path: str | os.PathLike, *, overwrite: bool = False, for_good: bool = True
+) -> Iterator[tuple[Path, int]]:
     """Yield (temporary path, open descriptor) of an empty file that takes the place of `path` when
     the block ends well, and with it the block of `together` around it.
 
     For libraries that write by name; they must write into the file that is there.
+    for_good: whether it must survive a power cut, for which a disk takes its time; not where a
+        reader knows what is damaged, and can do without.
     Errors as `publish`. A file that is replaced passes its owner and permissions on.
     """
     check_output(path, overwrite=overwrite)
     with together() as staged:
-        file = _stage(Path(path), overwrite)
+        file = _stage(Path(path), overwrite, for_good)
         staged.append(file)
         try:
             with _told(file.path):
                 yield file.partial, file.descriptor
                 _keep_rights(file)
-                os.fsync(file.descriptor)
+                if for_good:
+                    os.fsync(file.descriptor)
         except BaseException:
             staged.remove(file)
             file.discard()
@@ -219,7 +229,7 @@ _CUT_OFF = "is one of several results that were cut off halfway, and cannot foll
 _FOLLOWS = "make its folder writable: all results follow when plenocli next looks at one of them"
 
 
-def _stage(path: Path, overwrite: bool) -> _Staged:
+def _stage(path: Path, overwrite: bool, for_good: bool) -> _Staged:
     target = _target(path)
     partial = partial_path(target)
     try:
@@ -228,7 +238,12 @@ def _stage(path: Path, overwrite: bool) -> _Staged:
     except OSError as error:
         raise OutputError(f"cannot be written ({error.strerror})", path, remedy(error)) from error
     return _Staged(
-        path=path, target=target, partial=partial, descriptor=descriptor, overwrite=overwrite
+        path=path,
+        target=target,
+        partial=partial,
+        descriptor=descriptor,
+        overwrite=overwrite,
+        for_good=for_good,
     )
 
 
@@ -269,7 +284,7 @@ def _commit(staged: list[_Staged]) -> None:
         for file in several:
             with contextlib.suppress(OSError):
                 _before(file.target).unlink(missing_ok=True)
-        _sync_folders(file.target for file in staged)
+        _sync_folders(file.target for file in staged if file.for_good)
 
 
 def _take_back(staged: list[_Staged], announcements: list[Path]) -> None:

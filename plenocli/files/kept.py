@@ -70,7 +70,7 @@ def _place(name: str, inputs: list[np.ndarray]) -> Path | None:
 def write_arrays(path: Path, arrays: tuple[np.ndarray, ...]) -> None:
     """Put float64 arrays, in C order, into a file, whole or not at all. Raises OutputError."""
     head = json.dumps([_sum(path, arrays), [values.shape for values in arrays]]) + "\n"
-    publish(path, [head.encode(), *arrays], overwrite=True)
+    publish(path, [head.encode(), *arrays], overwrite=True, for_good=False)
 
 
 def _digest(name: str, inputs: list[np.ndarray]) -> str:

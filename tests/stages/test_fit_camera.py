@@ -14,9 +14,11 @@ from plenocli.files.artefacts.reading import read_artefact
 from plenocli.files.config.camera_file import load_camera, to_toml
 from plenocli.files.read.system_matrices import read_lenslet_matrix
 from plenocli.forward.sensor.noise import Noise
+from plenocli.inverse.picture import tiles
 from plenocli.inverse.picture.estimators import Estimators, Options
 from plenocli.inverse.picture.lenslet_model import Superpixels
-from plenocli.stages.inverse.reconstruct.fitted_matrix import with_fitted_camera
+from plenocli.stages.inverse.reconstruct import fitted_matrix
+from plenocli.stages.inverse.reconstruct.fitted_matrix import camera_fit
 from tests.forward.propagation.cameras import small_camera
 
 KEYS = {
@@ -28,6 +30,12 @@ KEYS = {
     "lenslet_array__count": (6, 6),
 }
 DISTANCE = 256.6e-6
+REAL = KEYS | {
+    "sensor__distance": DISTANCE,
+    "lenslet_array__pitch": 32e-6 / (1 + DISTANCE / 55e-3),
+    "object__distance": 0.553,
+    "main_lens__aberrations": ({"noll": 7, "coefficient": 2e-8},),
+}
 ALONE = ("--superpixels", "1x1", "--coherent-ring", "0", "--model", "fresnel")
 
 
@@ -35,14 +43,8 @@ ALONE = ("--superpixels", "1x1", "--coherent-ring", "0", "--model", "fresnel")
 def folder(tmp_path_factory):
     """A description, the real camera and its capture."""
     folder = tmp_path_factory.mktemp("fit")
-    real = KEYS | {
-        "sensor__distance": DISTANCE,
-        "lenslet_array__pitch": 32e-6 / (1 + DISTANCE / 55e-3),
-        "object__distance": 0.553,
-        "main_lens__aberrations": ({"noll": 7, "coefficient": 2e-8},),
-    }
     (folder / "camera.toml").write_text(to_toml(small_camera(**KEYS)))
-    (folder / "real.toml").write_text(to_toml(small_camera(**real)))
+    (folder / "real.toml").write_text(to_toml(small_camera(**REAL)))
     place = str(folder)
     assert run(["simulate-pif", f"{place}/real.toml", *ALONE, "-o", f"{place}/real.h5"]) == 0
     made = ["capture-sim", f"{place}/real.toml", "--pif", f"{place}/real.h5", "--snr", "50dB"]
@@ -194,6 +196,39 @@ def test_reconstruct_fits_the_camera_first(folder, capsys):
     assert fitted > max(right - 0.5, doubted + 1)
 
 
+def test_tiles_are_solved_by_the_camera_that_fits_the_middle(folder, monkeypatch):
+    """18 x 18 lenslets: the fit looks at 16 x 16 of them, in tiles as in one piece."""
+    large = to_toml(small_camera(**REAL | {"lenslet_array__count": (18, 18)}))
+    (folder / "large.toml").write_text(large)
+    capture, pif = folder / "many.h5", folder / "plain.h5"
+    made = ["capture-sim", str(folder / "large.toml"), "--pif", str(folder / "real.h5")]
+    made += ["--snr", "50dB", "--scene", "skimage:astronaut", "-o", str(capture)]
+    plain = ["simulate-pif", str(folder / "camera.toml"), *ALONE, "-o", str(pif)]
+    assert run(made) == 0 and run(plain) == 0
+    looked, found = [], {}
+    monkeypatch.setattr(
+        fitted_matrix,
+        "camera_fit",
+        lambda estimators, data, where: (
+            looked.append(data.y) or camera_fit(estimators, data, where)
+        ),
+    )
+    at_once = 9**2 * (256 + 100 + tiles.FURTHER)
+    for name, most in (("whole", tiles.AT_ONCE), ("tiled", at_once), ("again", at_once)):
+        monkeypatch.setattr(tiles, "AT_ONCE", most)
+        command = ["reconstruct", str(capture), "--pif", str(pif), "--method", "lmmse", "--fit"]
+        workers = ["--workers", "2"] if name == "again" else []
+        assert run([*command, *workers, "-o", str(folder / f"{name}.h5")]) == 0
+        found[name] = read_artefact(folder / f"{name}.h5", "image").data["image/value"]
+    assert [y.shape[:2] for y in looked] == [(16, 16)] * 3
+    for y in looked[1:]:
+        np.testing.assert_array_equal(y, looked[0])
+    truth = read_artefact(capture, "capture").data["capture/scene"][0]
+    error = {name: np.mean((value - truth) ** 2) for name, value in found.items()}
+    assert error["tiled"] == pytest.approx(error["whole"], rel=0.03)
+    assert (folder / "tiled.h5").read_bytes() == (folder / "again.h5").read_bytes()
+
+
 def test_a_fit_needs_a_matrix(folder, capsys):
     command = ["reconstruct", str(folder / "capture.h5"), "--pif", str(folder / "real.h5")]
     command += ["--method", "block-mean", "--fit", "-o", str(folder / "no.h5")]
@@ -230,11 +265,11 @@ def test_pixels_that_are_missing_do_not_matter_to_a_fit(folder):
     y += sigma * np.random.default_rng(4).standard_normal(y.shape)
     y[::2, ::2, 17] = np.nan
     seen = Superpixels(y=y, noise=Noise.of_sigma(sigma), accuracy=system.accuracy)
-    _, fit = with_fitted_camera(estimators, seen, "capture")
+    fit, _ = camera_fit(estimators, seen, "capture")
     assert fit.accepted and fit.lenslets == 36
     y[:, ::2, 17] = np.nan
     y[1::2, 1::2, 30] = np.nan
-    _, again = with_fitted_camera(estimators, seen, "capture")
+    again, _ = camera_fit(estimators, seen, "capture")
     assert again.accepted and again.lenslets == 36
     for one, other in zip(fit.parameters, again.parameters):
         assert abs(one.value - other.value) < 0.5 * one.sigma

@@ -65,6 +65,8 @@ def jumps(error, at):
         ("alone", "lmmse"),
         ("coupled", "tsvd"),
         ("coupled", "lmmse"),
+        ("alone", "weighted"),
+        pytest.param("coupled", "weighted", marks=pytest.mark.slow),
         pytest.param("alone", "pnp", marks=pytest.mark.slow),
         pytest.param("coupled", "tv", marks=pytest.mark.slow),
         pytest.param("coupled", "pnp", marks=pytest.mark.slow),
@@ -101,11 +103,28 @@ def test_tiles_give_the_picture_of_the_whole(folder, tmp_path, monkeypatch, name
     assert sorted(p.name for p in tmp_path.iterdir()) == ["tiled.h5", "whole.h5"]
 
 
+@pytest.mark.parametrize("method", ["tikhonov", "tsvd"])
+def test_hindsight_is_that_of_the_whole(folder, tmp_path, monkeypatch, method):
+    """Weights by the error of all tiles together."""
+    made, truths = folder
+    truth = "--truth", str(made / "coupled/capture.h5")
+    whole = picture(made / "coupled", tmp_path / "whole.h5", *truth, method=method)
+    monkeypatch.setattr(tiles, "AT_ONCE", SIDE**2 * (81 + 36 + tiles.FURTHER))
+    tiled = picture(made / "coupled", tmp_path / "tiled.h5", *truth, method=method)
+    told = [f.attrs["image"]["parameters"] for f in (whole, tiled)]
+    name = "alpha" if method == "tikhonov" else "rank"
+    assert told[0]["rule"] == told[1]["rule"] and "oracle" in told[0]["rule"]
+    assert told[1][name] == pytest.approx(told[0][name], rel=0.02)
+    one, two = (psnr(f.data["image/value"], truths["coupled"]) for f in (whole, tiled))
+    assert two == pytest.approx(one, abs=0.1)
+
+
 @pytest.mark.parametrize(
-    ("kind", "method"), [("coupled", "lmmse"), ("alone", "lmmse"), ("alone", "tv")]
+    ("kind", "method"),
+    [("coupled", "lmmse"), ("alone", "lmmse"), ("alone", "tv"), ("alone", "weighted")],
 )
 def test_results_do_not_depend_on_workers(folder, tmp_path, small_tiles, kind, method):
-    # threads of lmmse, processes of tv
+    # threads of lmmse, processes of the others
     made, _ = folder
     for workers in ("1", "2"):
         found = picture(
@@ -190,14 +209,16 @@ if __name__ == "__main__":
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("workers", ["1", "2"])
-def test_kill_9_loses_no_more_than_the_tiles_under_way(folder, tmp_path, monkeypatch, workers):
+@pytest.mark.parametrize(("workers", "method"), [("1", "lmmse"), ("2", "lmmse"), ("1", "weighted")])
+def test_kill_9_loses_no_more_than_the_tiles_under_way(
+    folder, tmp_path, monkeypatch, workers, method
+):
     made, at_once = folder[0] / "alone", (SIDE // 2) ** 2 * (81 + 36 + tiles.FURTHER)
     monkeypatch.setattr(tiles, "AT_ONCE", at_once)
-    picture(made, tmp_path / "right.h5", method="lmmse")
+    picture(made, tmp_path / "right.h5", method=method)
     (tmp_path / "elsewhere.py").write_text(ELSEWHERE)
     command = ["reconstruct", str(made / "capture.h5"), "--pif", str(made / "pif.h5")]
-    command += ["--method", "lmmse", "-o", str(tmp_path / "out.h5")]
+    command += ["--method", method, "-o", str(tmp_path / "out.h5")]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
     program = [sys.executable, str(tmp_path / "elsewhere.py"), str(at_once), *command]
 

@@ -6,14 +6,14 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable
 from concurrent.futures import Future
-from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, replace
-from functools import lru_cache
+from contextlib import nullcontext
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from threading import Lock
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -23,20 +23,21 @@ from plenocli.base.progress import collected_notes
 from plenocli.base.tiling import bands
 from plenocli.files.artefacts.provenance import require_file
 from plenocli.files.images.in_bands import SHARE
-from plenocli.files.images.mosaic import (
-    StoredCapture,
-    capture_in_file,
-    read_capture,
-    stored_capture,
-)
+from plenocli.files.images.mosaic import StoredCapture, capture_in_file, stored_capture
 from plenocli.files.read.calibrations import read_white
 from plenocli.files.scratch import Scratch
 from plenocli.inverse.picture.lenslet_model import LensletMatrix, Superpixels
-from plenocli.inverse.picture.superpixels import AlongTheGrid, superpixels
+from plenocli.inverse.picture.superpixels import (
+    along_the_grid,
+    require_tiled,
+    superpixels,
+)
 from plenocli.inverse.picture.tiles import EVERY, Area, Source
 
 if TYPE_CHECKING:
     from plenocli.forward.sensor.capture import Capture
+
+T = TypeVar("T")
 
 PART = 1 << 24
 """Bytes of rows that are read at a time."""
@@ -101,47 +102,6 @@ def _meant(name: Path, apart: set[Path]) -> list[Path]:
     return inside
 
 
-def read_superpixels(
-    path: str | Path,
-    system: LensletMatrix,
-    calibration: str | Path | None = None,
-    *,
-    each_pixel: bool = False,
-) -> Superpixels:
-    """Superpixels of a capture.
-
-    path: of the capture.
-    system: the system matrix in whose units they are wanted.
-    calibration: artefact along whose lenslet grid they are cut out; without it the capture is
-        tiled as its file says.
-    each_pixel: as for plenocli.inverse.picture.superpixels.superpixels.
-
-    Raises InputError where sizes disagree or the scale is not known.
-    """
-    capture = read_capture(path)
-    if calibration is None or capture.cfa != "mono":
-        return superpixels(capture, system)
-    return superpixels(
-        capture, system, read_white(calibration), where=calibration, each_pixel=each_pixel
-    )
-
-
-@dataclass(frozen=True)
-class _Held:
-    """Superpixels in memory."""
-
-    data: Superpixels
-
-    @property
-    def count(self) -> tuple[int, int]:
-        """Lenslets (rows, columns)."""
-        return self.data.y.shape[0], self.data.y.shape[1]
-
-    def cut(self, rows: slice, columns: slice, own: Area = EVERY) -> Superpixels:
-        """As of Source."""
-        return self.data.cut(rows, columns, own)
-
-
 class _Rows:
     """Rows of a stored capture, of which each thread that waits for them reads a part."""
 
@@ -202,6 +162,8 @@ class _Stored:
     """Superpixels that stay in the file of a capture, tiled as it says."""
 
     def __init__(self, windows: _Windows, system: LensletMatrix) -> None:
+        whole: Any = windows.capture.mosaic
+        require_tiled(replace(windows.capture.about, mosaic=whole), system)
         self.windows, self.system = windows, system
         self.count = (
             windows.capture.shape[0] // system.pixel_shape[0],
@@ -224,7 +186,6 @@ class _Stored:
         return replace(found, own=own)
 
 
-@contextmanager
 def superpixel_source(
     path: str | Path,
     system: LensletMatrix,
@@ -233,28 +194,29 @@ def superpixel_source(
     each_pixel: bool = False,
     beside: Path | None = None,
     verify: bool = True,
-) -> Iterator[Source]:
-    """As read_superpixels, but that those of a simulated capture stay in its file until they are
-    asked for.
+) -> Source:
+    """Superpixels of a capture, of which parts are asked for.
 
+    path: of the capture.
+    system: the system matrix in whose units they are wanted.
+    calibration: artefact along whose lenslet grid they are cut out; without it the capture is
+        tiled as its file says.
+    each_pixel: as for plenocli.inverse.picture.superpixels.superpixels.
     beside: the result, in whose folder a file that cannot be read in parts is decoded to one that
         can, where it is large, and superpixels along a grid are kept; None: they are held.
     verify: as of plenocli.files.artefacts.reading.opened_artefact; a file that was verified before
         is opened once.
+
+    Raises InputError where sizes disagree or the scale is not known.
     """
+    path = Path(path)
     if calibration is None:
-        path = Path(path)
-        windows = _opened(path, beside, anew=verify)
-        if _divides(system.pixel_shape, windows.capture):
-            yield _Stored(windows, system)
-            return
-    elif not each_pixel:
-        files = Path(path), Path(calibration)
-        with _turn:
-            source = _along_the_grid(*files, _Same(system), beside, tuple(map(_stamp, files)))
-        yield source
-        return
-    yield _Held(read_superpixels(path, system, calibration, each_pixel=each_pixel))
+        opened = partial(_opened, path, beside, verify=verify)
+        windows = _remembered((path, beside, _stamp(path)), opened, anew=verify)
+        return _Stored(windows, system)
+    files = path, Path(calibration)
+    key = *files, system, each_pixel, beside, *map(_stamp, files)
+    return _remembered(key, partial(_along_the_grid, *files, system, each_pixel, beside))
 
 
 def room_beside(target: Path | None) -> Scratch | None:
@@ -265,26 +227,18 @@ def room_beside(target: Path | None) -> Scratch | None:
     return None if target is None or not target.parent.is_dir() else Scratch(target)
 
 
-@dataclass(frozen=True, eq=False)
-class _Same:
-    """A system matrix, which is equal to itself alone."""
-
-    matrix: LensletMatrix
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Same) and other.matrix is self.matrix
-
-    def __hash__(self) -> int:
-        return id(self.matrix)
+def _opened(path: Path, beside: Path | None, *, verify: bool) -> _Windows:
+    """Windows of a capture."""
+    with stored_capture(path, room=room_beside(beside), verify=verify) as stored:
+        return _Windows(stored)
 
 
-@lru_cache(maxsize=1)
 def _along_the_grid(
-    path: Path, calibration: Path, system: _Same, beside: Path | None, stamps: object
-) -> AlongTheGrid:
+    path: Path, calibration: Path, system: LensletMatrix, each_pixel: bool, beside: Path | None
+) -> Source:
     """Superpixels along the grid of a calibration, which take a while: tiles have them in common.
 
-    stamps: of both files.
+    Arguments as of superpixel_source.
     """
     room = room_beside(beside)
     capture = capture_in_file(path, room=room)
@@ -292,26 +246,26 @@ def _along_the_grid(
     is_held = room is None or numbers <= budget().memory // SHARE
     known = read_white(calibration, in_file=True)
     kept: Any = np.empty if is_held else room
-    return AlongTheGrid(capture, system.matrix, known, calibration, kept)
+    return along_the_grid(
+        capture, system, known, where=calibration, each_pixel=each_pixel, room=kept
+    )
 
 
 _turn = Lock()
 """Threads open captures in turn, so that the second finds what the first has made."""
-_open: list[tuple[Any, _Windows]] = []
-"""The capture that was opened last, and what it goes by."""
+_open: list[tuple[Any, Any]] = []
+"""What was opened last, and all that it goes by."""
 
 
-def _opened(path: Path, beside: Path | None, *, anew: bool) -> _Windows:
-    """Windows of a capture, as they were opened before where nothing has changed.
+def _remembered(key: Any, make: Callable[[], T], *, anew: bool = False) -> T:
+    """What was made under this key before where that was the last one, else what is made now.
 
-    anew: opened and verified in any case.
+    anew: in any case.
     """
     with _turn:
-        key = path, beside, _stamp(path)
         if anew or not _open or _open[0][0] != key:
             _open.clear()
-            with stored_capture(path, room=room_beside(beside), verify=anew) as stored:
-                _open.append((key, _Windows(stored)))
+            _open.append((key, make()))
         return _open[0][1]
 
 
@@ -319,17 +273,9 @@ def forget_captures() -> None:
     """Let go what was opened last, and the files that it was decoded to."""
     with _turn:
         _open.clear()
-        _along_the_grid.cache_clear()
 
 
 def _stamp(path: str | Path) -> tuple[int, int]:
     """What tells a file from another one of its name. Raises InputError."""
     size = require_file(path)
     return size, Path(path).stat().st_mtime_ns
-
-
-def _divides(shape: tuple[int, int], capture: StoredCapture) -> bool:
-    """Whether superpixels tile a sensor; where they do not, the reader says why."""
-    said = capture.about.grid.shape if capture.about.grid else None
-    whole = not any(pixels % n for pixels, n in zip(capture.shape, shape))
-    return whole and said in (None, shape) and capture.about.cfa == "mono"

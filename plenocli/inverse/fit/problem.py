@@ -47,13 +47,19 @@ class CapturedLenslets:
 
     def middle(self, most: int) -> CapturedLenslets:
         """The lenslets in the middle, `most` a side; itself where there are no more."""
-        rows, columns = self.y.shape[:2]
-        if max(rows, columns) <= most:
+        count = self.y.shape[0], self.y.shape[1]
+        if max(count) <= most:
             return self
-        r, c = (max(0, (n - most) // 2) for n in (rows, columns))
-        at = slice(r, r + most), slice(c, c + most)
+        at = middle_of(count, most)
         clipped = None if self.saturated is None else self.saturated[at]
         return CapturedLenslets(self.y[at], self.sigma, clipped)
+
+
+def middle_of(count: tuple[int, int], most: int) -> tuple[slice, slice]:
+    """The lenslets in the middle of `count` (rows, columns), `most` a side at most."""
+    first = (max(0, (n - most) // 2) for n in count)
+    rows, columns = (slice(start, min(start + most, n)) for start, n in zip(first, count))
+    return rows, columns
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -33,9 +33,10 @@ class MatrixOrigin:
     coherent_ring: int = 0
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class LensletMatrix:
-    """What superpixels see of objects, the wavelengths of a pif gathered into its bands.
+    """What superpixels see of objects, the wavelengths of a pif gathered into its bands; equal to
+    itself alone.
 
     path: the pif, for messages.
     blocks: (offset, pixel, point), points of several bands one band after the other; in single
@@ -129,13 +130,16 @@ Shared = Literal[
     "kept",  # share of detail
     "seen",  # Seen
     "contrasts",  # probability of each contrast, by estimator
-    "power",  # of directions, by which weights go
+    "power",  # of directions, by which weights go, and
+    "cross",  # what they share with the truth, with hindsight
     "start",  # squared error expected of what methods of the picture start from
     "veil level",
+    "solver",  # WeightedLmmse, and
+    "told",  # what it tells, WeightedStats
     "wider",  # factor of standard deviations, by estimator
 ]
 """What the pieces of a capture have in common."""
-MEANS: tuple[Shared, ...] = ("contrasts", "power", "start", "veil level", "wider")
+MEANS: tuple[Shared, ...] = ("contrasts", "power", "cross", "start", "veil level", "wider")
 """What is a mean over pieces from all over; the others are those of the one piece."""
 Common = Callable[..., Any]
 """(name, what works it out, which of that name): the value, see Superpixels.common."""

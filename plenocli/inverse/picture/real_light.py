@@ -9,7 +9,8 @@ docs/model.md, "Real light".
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import math
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,9 +20,9 @@ import numpy as np
 from plenocli.base.errors import InputError
 from plenocli.base.progress import note
 from plenocli.base.text import by
-from plenocli.base.tiling import EVERYTHING, Plane, bands
+from plenocli.base.tiling import EVERYTHING, Plane, Room, bands
 from plenocli.forward.sensor.noise import Noise
-from plenocli.forward.sensor.superpixel import extract
+from plenocli.forward.sensor.superpixel import extract_rows
 from plenocli.inverse.calibration.calibration import there
 from plenocli.inverse.picture.lenslet_model import LensletMatrix, Superpixels
 
@@ -29,6 +30,10 @@ if TYPE_CHECKING:
     from plenocli.forward.sensor.capture import Capture
     from plenocli.inverse.calibration.calibration import Calibration
 
+AT_ONCE = 1 << 19
+"""Pixels of superpixels that are worked on at a time."""
+MARGIN = 64
+"""Pixels beyond superpixels that are read with them: splines forget what is further away."""
 CENTRED = 0.01
 """px: windows that lie so well about their lenslets are taken as they are."""
 FARTHEST = 2.0
@@ -51,56 +56,159 @@ NORMAL = 1.4826
 """Standard deviation over median absolute deviation, of a normal distribution."""
 
 
-def along_the_grid(
-    capture: Capture, system: LensletMatrix, calibration: Calibration, where: str | Path | None
-) -> Superpixels:
-    """A capture cut out along a calibration's grid, with the variance of every pixel.
+class EachPixel:
+    """A capture cut out along a calibration's grid, with the variance of every pixel; worked out in
+    bands of lenslets, and cut when it is asked for.
 
+    capture, calibration: with windows, white and dark; what of them stays in files is read in
+        bands.
     system: the system matrix, with the pixels of the calibration's windows, or with pixels that
         hold a whole number of them.
-    calibration: with windows, white and dark.
     where: the calibration's file, for messages.
+    room: as of plenocli.inverse.picture.superpixels.along_the_grid.
 
-    Returns y, NaN where a pixel counts for nothing, and its variance, inf there.
     Raises InputError where sizes differ.
     """
-    windows, window_shape = there(calibration.windows), there(calibration.windows).shape
-    bins = _bins(window_shape, system.pixel_shape, where)
-    signal = above_dark(capture, calibration)
-    if capture.mask is not None:
-        signal = np.where(capture.mask, np.nan, signal)
-    white = there(there(calibration.white).superpixels)
-    count = calibration.grid.valid.shape
-    white = np.broadcast_to(white, (*count, white.shape[-1])).astype(float)
-    cut = extract(signal, windows.origin, window_shape)
-    lit = calibration.grid.valid & np.isfinite(white).any(axis=2) & np.isfinite(cut).any(axis=2)
-    usable = np.isfinite(cut) & np.isfinite(white) & lit[..., None]
-    over = capture.levels.white - float(np.max(capture.levels.black))
-    usable &= cut < over if np.isfinite(over) else True
-    moved = motion(cut, white, usable, window_shape)
-    middle = windows.origin + (np.asarray(window_shape) - 1) / 2
-    aside = np.where(lit[..., None], calibration.grid.centres - middle, 0.0)
-    noise = pixel_noise(capture, calibration, cut, white, usable)
-    if np.abs(aside).max(initial=0) > CENTRED or np.abs(moved).max() > CENTRED:
-        image = _pasted(white, windows.origin, window_shape, signal.shape)
-        places = np.where(lit[..., None], middle + aside, 0.0)
-        cut = sampled(signal, places + moved, window_shape)
-        white = sampled(image, places, window_shape)
-    if np.abs(moved).max() > CENTRED:
-        note(
-            f"{capture.name}: the lenslets lie {moved[0]:+.2f} rows and {moved[1]:+.2f} columns "
-            "from where the white image has them; superpixels are taken there"
+
+    def __init__(
+        self,
+        capture: Capture,
+        system: LensletMatrix,
+        calibration: Calibration,
+        where: str | Path | None,
+        room: Room = np.empty,
+    ) -> None:
+        bins = _bins(there(calibration.windows).shape, system.pixel_shape, where)
+        light = _Light(capture, calibration)
+        self.count, self.pixels = light.count, math.prod(system.pixel_shape)
+        moved, noise = light.settle(), pixel_noise(capture, calibration, light)
+        kept = room((self.pixels, *self.count), np.dtype(float))
+        for rows in light.bands:
+            kept[:, rows] = np.moveaxis(binned(light.white(rows), light.window, bins), 2, 0)
+        if np.abs(moved).max() > CENTRED:
+            note(
+                f"{capture.name}: the lenslets lie {moved[0]:+.2f} rows and {moved[1]:+.2f} "
+                "columns from where the white image has them; superpixels are taken there"
+            )
+        common, even = in_common(kept, light.lit), system.blocks.sum(axis=(0, 2), dtype=float)
+        size = self.count[0] * self.count[1], self.pixels
+        self._y, self._variance = (room(size, np.dtype(float)) for _ in range(2))
+        for rows in light.bands:
+            white, dusty = typical_white(np.moveaxis(kept[:, rows], 0, 2), common, rows)
+            cut, usable = (binned(a, light.window, bins) for a in light.seen(rows))
+            usable = (usable > 0.99) & ~dusty & (even > DARK * even.max()) & (white > 0)
+            factor = np.where(usable, even / np.where(usable, white, 1.0), 0.0)
+            cut = np.where(usable, cut, 0.0)
+            variance = noise.variance(np.maximum(cut, 0.0)) / np.prod(bins) * factor**2
+            own = slice(rows.start * self.count[1], rows.stop * self.count[1])
+            y = np.where(usable, cut * factor, np.nan)
+            self._y[own, :] = y.reshape(-1, self.pixels)
+            variance = np.where(usable, variance, np.inf)
+            self._variance[own, :] = variance.reshape(-1, self.pixels)
+
+    def cut(
+        self, rows: slice, columns: slice, own: tuple[slice, slice] = (EVERYTHING, EVERYTHING)
+    ) -> Superpixels:
+        """As of plenocli.inverse.picture.tiles.Source: y, NaN where a pixel counts for nothing, and
+        its variance, inf there.
+        """
+        first, last, _ = rows.indices(self.count[0])
+        lenslets = slice(first * self.count[1], last * self.count[1])
+        y, variance = (
+            kept[lenslets, :].reshape(last - first, self.count[1], self.pixels)[:, columns]
+            for kept in (self._y, self._variance)
         )
-    cut, white, usable = (binned(a, window_shape, bins) for a in (cut, white, usable * 1.0))
-    even = system.blocks.sum(axis=(0, 2), dtype=float)
-    white, dusty = typical_white(white, lit)
-    usable = (usable > 0.99) & ~dusty & (even > DARK * even.max()) & (white > 0)
-    factor = np.where(usable, even / np.where(usable, white, 1.0), 0.0)
-    variance = noise.variance(np.maximum(np.where(usable, cut, 0.0), 0.0)) / np.prod(bins)
-    return Superpixels(
-        y=np.where(usable, np.where(usable, cut, 0.0) * factor, np.nan),
-        variance=np.where(usable, variance * factor**2, np.inf),
-    )
+        return Superpixels(y=y, variance=variance, own=own)
+
+
+class _Light:
+    """What the windows of a capture and of the white image hold, in bands of lenslets.
+
+    count: lenslets (rows, columns).
+    window: (rows, columns) px.
+    bands: rows of lenslets.
+    lit: (lenslet_row, lenslet_column), which of them count.
+    """
+
+    def __init__(self, capture: Capture, calibration: Calibration) -> None:
+        windows = there(calibration.windows)
+        self._capture, self._calibration = capture, calibration
+        self._origin, self.window = windows.origin, windows.shape
+        self._white = there(there(calibration.white).superpixels)
+        self.count: tuple[int, int] = calibration.grid.valid.shape
+        self.bands = bands(self.count[0], AT_ONCE // (math.prod(self.window) * self.count[1]))
+        self.lit = np.zeros(self.count, bool)
+        self._signal = Plane(capture.shape, self._above_dark)
+        self._places: np.ndarray | None = None
+        self._moved = np.zeros(2)
+
+    def _above_dark(self, rows: slice, _: slice) -> np.ndarray:
+        """(row, column) of some rows of the sensor, NaN where a pixel counts for nothing."""
+        signal, mask = above_dark(self._capture, self._calibration, rows), self._capture.mask
+        return signal if mask is None else np.where(mask[rows], np.nan, signal)
+
+    def _of_white(self, rows: slice) -> np.ndarray:
+        white = self._white if self._white.ndim == 1 else self._white[rows]
+        shape = rows.stop - rows.start, self.count[1], white.shape[-1]
+        return np.broadcast_to(white, shape).astype(float)
+
+    def windows(self, rows: slice) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(capture, white, which pixels count) of some rows of lenslets, (lenslet_row,
+        lenslet_column, pixel), as they lie on the sensor.
+        """
+        cut = extract_rows(self._signal, self._origin[rows], self.window)
+        white = self._of_white(rows)
+        known = np.isfinite(cut), np.isfinite(white)
+        lit = known[0].any(axis=2) & known[1].any(axis=2) & self._calibration.grid.valid[rows]
+        self.lit[rows] = lit
+        usable = known[0] & known[1] & lit[..., None]
+        levels = self._capture.levels
+        over = levels.white - float(np.max(levels.black))
+        return cut, white, usable & (cut < over) if np.isfinite(over) else usable
+
+    def __iter__(self) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+        return map(self.windows, self.bands)
+
+    def settle(self) -> np.ndarray:
+        """Where lenslets lie from where the white image has them, (2,) rows and columns, px; from
+        then on they are sampled there, unless windows lie well about them.
+        """
+        self._moved = moved = motion(self, self.window)
+        middle = self._origin + (np.asarray(self.window) - 1) / 2
+        aside = np.where(self.lit[..., None], self._calibration.grid.centres - middle, 0.0)
+        if np.abs(aside).max(initial=0) > CENTRED or np.abs(moved).max() > CENTRED:
+            self._places = np.where(self.lit[..., None], middle + aside, np.nan)
+        return moved
+
+    def seen(self, rows: slice) -> tuple[np.ndarray, np.ndarray]:
+        """(superpixels of the capture, which of their pixels count), (lenslet_row, lenslet_column,
+        pixel).
+        """
+        cut, _, usable = self.windows(rows)
+        if self._places is None:
+            return cut, usable
+        places = self._places[rows] + self._moved
+        near = rows_around(places, self.window[0], self._signal.shape[0])
+        image = self._signal.read(near, EVERYTHING)
+        return sampled(image, places - (near.start, 0), self.window), usable
+
+    def white(self, rows: slice) -> np.ndarray:
+        """Superpixels of the white image, as `seen`."""
+        if self._places is None:
+            return self._of_white(rows)
+        places, height = self._places[rows], self.window[0]
+        near = rows_around(places, height, self._signal.shape[0])
+        first, last = self._origin[..., 0], self._origin[..., 0] + height
+        touch = (last > near.start) & (first < near.stop) & (first >= 0)
+        lines = np.flatnonzero(touch.any(axis=1))
+        if not len(lines):
+            return np.full((*places.shape[:2], math.prod(self.window)), np.nan)
+        some = slice(int(lines[0]), int(lines[-1]) + 1)
+        top = int(first[touch].min())
+        size = min(int(last[touch].max()), self._signal.shape[0]) - top, self._signal.shape[1]
+        origin = np.where(touch[some, :, None], self._origin[some] - (top, 0), -1)
+        image = _pasted(self._of_white(some), origin, self.window, size)
+        return sampled(image, places - (top, 0), self.window)
 
 
 def above_dark(capture: Capture, calibration: Calibration, rows: slice = EVERYTHING) -> np.ndarray:
@@ -124,18 +232,33 @@ def above_dark(capture: Capture, calibration: Calibration, rows: slice = EVERYTH
 
 
 def motion(
-    cut: np.ndarray, white: np.ndarray, usable: np.ndarray, shape: tuple[int, int]
+    parts: Iterable[tuple[np.ndarray, np.ndarray, np.ndarray]], shape: tuple[int, int]
 ) -> np.ndarray:
     """Where the lenslets of a capture lie, from where the white image has them.
 
     An evenly lit superpixel is b white(p - d) + o; d is fitted with b and o to first order in every
     lenslet, and the median over those with the least structure taken.
 
-    cut, white: (lenslet_row, lenslet_column, pixel).
-    usable: like cut.
+    parts: as of noise_of_parts.
     shape: (rows, columns) of a superpixel.
 
     Returns d (2,) rows and columns, px; 0 where it is not above four standard errors.
+    """
+    rests = np.concatenate([_motions(*part, shape) for part in parts])
+    if len(rests) < 8:
+        return np.zeros(2)
+    calm = rests[np.argsort(rests[:, 0])[: max(8, int(FLAT * len(rests)))], 1:]
+    shift = np.median(calm, axis=0)
+    error = NORMAL * np.median(np.abs(calm - shift), axis=0) * np.sqrt(np.pi / 2 / len(calm))
+    sure = (np.abs(shift) > 4 * error) & (np.abs(shift) < FARTHEST)
+    return np.where(sure, shift, 0.0)
+
+
+def _motions(
+    cut: np.ndarray, white: np.ndarray, usable: np.ndarray, shape: tuple[int, int]
+) -> np.ndarray:
+    """(lenslet, 3) what an even object does not explain of the lenslets that are wholly known, root
+    mean square over their brightness, and d.
     """
     found = []
     for y, w, good in zip(*(a.reshape(-1, a.shape[-1]) for a in (cut, white, usable))):
@@ -147,14 +270,21 @@ def motion(
         if fitted[0] > DARK:
             rest = np.sqrt(np.mean((y - terms @ fitted) ** 2)) / (fitted[0] * w.max())
             found.append([rest, *(fitted[1:3] / fitted[0])])
-    if len(found) < 8:
-        return np.zeros(2)
-    rests = np.array(found)
-    calm = rests[np.argsort(rests[:, 0])[: max(8, int(FLAT * len(rests)))], 1:]
-    shift = np.median(calm, axis=0)
-    error = NORMAL * np.median(np.abs(calm - shift), axis=0) * np.sqrt(np.pi / 2 / len(calm))
-    sure = (np.abs(shift) > 4 * error) & (np.abs(shift) < FARTHEST)
-    return np.where(sure, shift, 0.0)
+    return np.array(found).reshape(-1, 3)
+
+
+def rows_around(centres: np.ndarray, height: float, count: int) -> slice:
+    """Rows of an image of `count` rows that splines need for windows about places, from an even one
+    on.
+
+    centres: (.., 2) px, NaN where nothing is wanted.
+    height: of a window, px.
+    """
+    known = centres[..., 0][np.isfinite(centres[..., 0])]
+    ends = np.array([known.min(), known.max()] if known.size else [0.0, 0.0])
+    reach = MARGIN + height / 2
+    top, bottom = np.clip(ends + (-reach, reach), 0, count).astype(int) // 2 * 2 + (0, 2)
+    return slice(int(top), min(int(bottom), count))
 
 
 def sampled(
@@ -192,22 +322,23 @@ def sampled(
     return np.where(off, np.nan, values).reshape(*centres.shape[:-1], -1)
 
 
-def typical_white(white: np.ndarray, lit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def typical_white(
+    white: np.ndarray, common: Common | None, rows: slice = EVERYTHING
+) -> tuple[np.ndarray, np.ndarray]:
     """The white image with less noise: what all lenslets have in common, times the brightness of
     each; where a pixel differs from that beyond the noise, its own.
 
-    white: (lenslet_row, lenslet_column, pixel), NaN where it is not known.
-    lit: (lenslet_row, lenslet_column), which of them count.
+    white: (lenslet_row, lenslet_column, pixel) of some rows of lenslets, NaN where it is not known.
+    common: of `in_common`.
 
     Returns it, and which pixels lie under dust.
     """
     own = np.where(np.isfinite(white), white, 0.0)
-    found = in_common(np.moveaxis(white, 2, 0), lit)
-    if found is None:
+    if common is None:
         return own, np.zeros(white.shape, bool)
-    typical = found.typical()
+    typical = common.typical(rows)
     with np.errstate(invalid="ignore"):
-        kept = np.abs(own - typical) <= UNLIKE * found.spread * typical
+        kept = np.abs(own - typical) <= UNLIKE * common.spread * typical
         return np.where(kept, typical, own), own < DUST * typical
 
 
@@ -313,28 +444,18 @@ def binned(values: np.ndarray, shape: tuple[int, int], bins: tuple[int, int]) ->
 def pixel_noise(
     capture: Capture,
     calibration: Calibration,
-    cut: np.ndarray,
-    white: np.ndarray,
-    usable: np.ndarray,
+    parts: Iterable[tuple[np.ndarray, np.ndarray, np.ndarray]],
 ) -> Noise:
     """Of a pixel: as the capture tells, as the calibration does, else from the capture itself.
 
-    cut, white: (lenslet_row, lenslet_column, pixel) of the capture and of the white image.
-    usable: like cut.
+    parts: as of noise_of_parts.
     """
-    return told_noise(capture, calibration) or noise_of_parts(
-        capture, calibration, [(cut, white, usable)]
-    )
-
-
-def told_noise(capture: Capture, calibration: Calibration) -> Noise | None:
-    """Of a pixel, as the capture tells or the calibration does; None where neither does."""
     if capture.noise is not None and capture.noise.without_signal > 0:
         return capture.noise
     sensor = calibration.sensor
     if sensor.gain is not None:
         return Noise(gain=sensor.gain, read_variance=sensor.read_variance)
-    return None
+    return noise_of_parts(capture, calibration, parts)
 
 
 def noise_of_parts(
@@ -344,13 +465,14 @@ def noise_of_parts(
 ) -> Noise:
     """Of a pixel, from the capture itself.
 
-    parts: cut, white and usable, as of pixel_noise, of some rows of lenslets after the other.
+    parts: (capture, white, which pixels count), (lenslet_row, lenslet_column, pixel), of some rows
+        of lenslets after the other.
     """
     shape, apart = there(calibration.windows).shape, 1 if capture.cfa == "mono" else 2
     shares, peak = [], 0.0
     for cut, white, usable in parts:
         shares.append(_unlike_neighbours(cut, white, usable, shape, apart))
-        peak = max(peak, float(np.nanmax(np.abs(white))))
+        peak = max(peak, float(np.max(np.abs(white), where=np.isfinite(white), initial=0.0)))
     # a sensor without noise is none
     least = max(calibration.sensor.read_variance, (1e-6 * peak) ** 2)
     return Noise(gain=_photon_transfer(np.concatenate(shares)), read_variance=least)

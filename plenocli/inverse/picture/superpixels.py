@@ -20,7 +20,7 @@ from plenocli.forward.sensor.superpixel import extract_rows
 from plenocli.inverse.calibration.calibration import there
 from plenocli.inverse.picture.lenslet_model import LensletMatrix, Superpixels
 from plenocli.inverse.picture.nuisances.vignetting import falloff_in_bands
-from plenocli.inverse.picture.real_light import above_dark, along_the_grid
+from plenocli.inverse.picture.real_light import EachPixel, above_dark
 from plenocli.inverse.picture.tiles import EVERY, Area
 
 if TYPE_CHECKING:
@@ -53,18 +53,17 @@ def superpixels(
     Raises InputError where sizes disagree or the scale is not known.
     """
     path = capture.metadata.path
-    _require_grey(capture)
     if calibration is not None:
-        if each_pixel:
-            return along_the_grid(capture, system, calibration, where)
-        return AlongTheGrid(capture, system, calibration, where).cut(*EVERY)
+        return along_the_grid(capture, system, calibration, where=where, each_pixel=each_pixel).cut(
+            *EVERY
+        )
+    shape = require_tiled(capture, system)
     light = capture.metadata.illuminant
     if system.illuminant and light and light != system.illuminant:
         note(
             f"{capture.name} was lit by {light}, the system matrix has its bands for "
             f"{system.illuminant}: colours will be off"
         )
-    shape = _tiles(capture, system, path)
     signal, unit = capture.signal(), _unit(capture, path)
     levels = capture.levels
     clipped = (
@@ -81,6 +80,50 @@ def superpixels(
         pif_digest=capture.metadata.matrix,
         saturated=clipped,
     )
+
+
+def along_the_grid(
+    capture: Capture,
+    system: LensletMatrix,
+    calibration: Calibration,
+    *,
+    where: str | Path | None = None,
+    each_pixel: bool = False,
+    room: Room = np.empty,
+) -> EachPixel | AlongTheGrid:
+    """Superpixels cut out along the grid of a calibration, of which parts are asked for.
+
+    Arguments as of superpixels.
+
+    room: for numbers of a shape and dtype, put and looked at by slices.
+
+    Raises InputError where sizes differ, or for a sensor with colours.
+    """
+    _require_grey(capture)
+    along = EachPixel if each_pixel else AlongTheGrid
+    return along(capture, system, calibration, where, room)
+
+
+def require_tiled(capture: Capture, system: LensletMatrix) -> tuple[int, int]:
+    """(rows, columns) of a superpixel, px; InputError where the capture is not tiled like the
+    system matrix.
+    """
+    _require_grey(capture)
+    path = capture.metadata.path
+    shape = (capture.grid.shape if capture.grid else None) or system.pixel_shape
+    if shape != system.pixel_shape:
+        raise InputError(
+            (f"has superpixels of {by(shape)} pixels, the system matrix {by(system.pixel_shape)}"),
+            path,
+            "use the pif of this camera",
+        )
+    if capture.shape[0] % shape[0] or capture.shape[1] % shape[1]:
+        raise InputError(
+            f"has {by(capture.shape)} pixels, no whole number of superpixels of {by(shape)}",
+            path,
+            "give --calibration to find the lenslets",
+        )
+    return shape
 
 
 def _require_grey(capture: Capture) -> None:
@@ -119,9 +162,9 @@ class AlongTheGrid:
 
     capture, calibration: what of them stays in files is read in bands.
     system, where: as of superpixels.
-    room: for numbers of a shape and dtype, put and looked at by slices.
+    room: as of along_the_grid.
 
-    Raises InputError where sizes differ, or for a sensor with colours.
+    Raises InputError where sizes differ.
     """
 
     def __init__(
@@ -132,7 +175,6 @@ class AlongTheGrid:
         where: str | Path | None,
         room: Room = np.empty,
     ) -> None:
-        _require_grey(capture)
         self.count: tuple[int, int] = calibration.grid.valid.shape
         self.pixels = int(np.prod(there(calibration.windows).shape))
         if self.pixels != system.own.shape[0]:
@@ -221,26 +263,6 @@ def _clipped(capture: Capture, calibration: Calibration, rows: slice) -> np.ndar
 
     cut = extract_rows(Plane(capture.shape, over), windows.origin[rows], windows.shape)
     return (cut == 1).reshape(-1, cut.shape[2])
-
-
-def _tiles(capture: Capture, system: LensletMatrix, path: Path | None) -> tuple[int, int]:
-    """(rows, columns) of a superpixel, px; InputError where the capture is not tiled like the
-    system matrix.
-    """
-    shape = (capture.grid.shape if capture.grid else None) or system.pixel_shape
-    if shape != system.pixel_shape:
-        raise InputError(
-            (f"has superpixels of {by(shape)} pixels, the system matrix {by(system.pixel_shape)}"),
-            path,
-            "use the pif of this camera",
-        )
-    if capture.shape[0] % shape[0] or capture.shape[1] % shape[1]:
-        raise InputError(
-            f"has {by(capture.shape)} pixels, no whole number of superpixels of {by(shape)}",
-            path,
-            "give --calibration to find the lenslets",
-        )
-    return shape
 
 
 def _unit(capture: Capture, path: Path | None) -> float:

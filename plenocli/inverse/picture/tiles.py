@@ -86,11 +86,11 @@ def side_of(system: LensletMatrix) -> int:
 
 def tiles_of(estimators: Estimators, method: Method, count: tuple[int, int]) -> list[Tile]:
     """The tiles of a capture of `count` lenslets (rows, columns), row by row; one where it is no
-    larger than a tile, or where the method takes it whole.
+    larger than a tile.
     """
     side = side_of(estimators.system)
     every = (slice(0, count[0]), slice(0, count[1]))
-    if not method.in_tiles or count[0] * count[1] <= side**2:
+    if count[0] * count[1] <= side**2:
         return [Tile(every, every)]
     margin = _margin(estimators, method)
 
@@ -117,7 +117,7 @@ def _even(count: int, most: int) -> list[slice]:
 def _margin(estimators: Estimators, method: Method) -> int:
     """Lenslets around a tile that its own depend on."""
     if method.sees is Sees.LENSLET_AS_IS:
-        return 0
+        return method.lenslets_around
     reach = int(np.abs(estimators.system.offsets).max(initial=0))
     near = 2 + reach if estimators.overlap == 3 or reach else 0
     if method.sees is Sees.PICTURE:

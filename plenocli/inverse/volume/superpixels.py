@@ -25,9 +25,9 @@ from plenocli.inverse.picture.real_light import (
     above_dark,
     binned,
     in_common,
-    noise_of_parts,
+    pixel_noise,
+    rows_around,
     sampled,
-    told_noise,
 )
 from plenocli.inverse.volume.measurement import AT_ONCE, Measurement
 
@@ -44,8 +44,6 @@ LEAST_DUST, MOST_DUST = 0.02, 0.02
 """Of a pixel's light, what dust takes away at the least, and what is left at the least: such pixels
 count for nothing anyhow.
 """
-MARGIN = 64
-"""Pixels beyond superpixels that are read with them: splines forget what is further away."""
 DIM = 0.05
 """Of the usual white level, below which a lenslet counts for nothing."""
 
@@ -208,10 +206,8 @@ def _sampled(
     means of as many samples as a step has whole pixels. Of the image no more rows are read than the
     centres need.
     """
-    around = MARGIN + shape[0] * step[0] / 2
-    ends = np.array([-around, around]) + _ends(centres[..., 0])
-    top, bottom = np.clip(ends, 0, image.shape[0]).astype(int) // 2 * 2 + (0, 2)
-    seen, centres = image.read(slice(int(top), int(bottom)), EVERYTHING), centres - (top, 0)
+    near = rows_around(centres, shape[0] * step[0], image.shape[0])
+    seen, centres = image.read(near, EVERYTHING), centres - (near.start, 0)
     bins = _bins(step)
     step = step[0] / bins[0], step[1] / bins[1]
     shape = shape[0] * bins[0], shape[1] * bins[1]
@@ -229,12 +225,6 @@ def _sampled(
         nearest = (axes[0] == row)[..., :, None] & (axes[1] == column)[..., None, :]
         values = np.where(nearest, part, values)
     return binned(values.reshape(*centres.shape[:-1], -1), shape, bins)
-
-
-def _ends(values: np.ndarray) -> np.ndarray:
-    """The least and the greatest of the numbers among values; 0 where there are none."""
-    known = values[np.isfinite(values)]
-    return np.array([known.min(), known.max()] if known.size else [0.0, 0.0])
 
 
 def _bins(step: tuple[float, float]) -> tuple[int, int]:
@@ -338,9 +328,7 @@ def _resampled(
     lit = np.isfinite(level) & (level > DIM * usual)
     # lenslets see less towards the corners, which is no property of the specimen
     even = np.where(lit, level / usual, 1.0)[..., None]
-    noise = told_noise(capture, calibration) or noise_of_parts(
-        capture, calibration, _beside_white(light, calibration, lit)
-    )
+    noise = pixel_noise(capture, calibration, _beside_white(light, calibration, lit))
     dust = None
     if not corners and white.flat is not None and lit.any():
         flat = Plane.of(white.flat)

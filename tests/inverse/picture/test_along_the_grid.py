@@ -15,7 +15,7 @@ from plenocli.files.scratch import Scratch
 from plenocli.forward.sensor.capture import Capture, Levels
 from plenocli.forward.sensor.frames import Dark
 from plenocli.inverse.calibration.calibration import Calibration, Sensor, White, Windows
-from plenocli.inverse.picture.superpixels import AlongTheGrid
+from plenocli.inverse.picture.superpixels import AlongTheGrid, along_the_grid
 from tests.reference.calibrations import lenslet_grid
 
 SIDE, ROWS, COLUMNS, FRAME = 9, 31, 22, 5
@@ -99,7 +99,7 @@ def test_bands_in_a_file_are_those_of_one_piece(made, tmp_path, monkeypatch, len
 def test_colours_and_other_windows_are_refused(made):
     capture, calibration, system, _ = made
     with pytest.raises(InputError, match="has the colour filter array RGGB"):
-        AlongTheGrid(replace(capture, cfa="RGGB"), system, calibration, None)
+        along_the_grid(replace(capture, cfa="RGGB"), system, calibration)
     small = SimpleNamespace(own=np.ones((25, 4)), blocks=np.ones((1, 25, 4)), pixel_shape=(5, 5))
     with pytest.raises(InputError, match="holds windows of 81 pixels, the system matrix 25"):
         AlongTheGrid(capture, small, calibration, "c.h5")

@@ -11,20 +11,24 @@ import pytest
 
 import plenocli as pc
 from plenocli.base.errors import InputError
+from plenocli.base.tiling import Plane
 from plenocli.files.images.mosaic import read_capture
+from plenocli.files.scratch import Scratch
 from plenocli.forward.sensor.capture import Capture, Levels
 from plenocli.inverse.calibration.measure import calibrate
-from plenocli.inverse.picture import hold_out
+from plenocli.inverse.picture import hold_out, real_light
 from plenocli.inverse.picture.estimators import Estimators, Options
 from plenocli.inverse.picture.lenslet_model import LensletMatrix
 from plenocli.inverse.picture.methods.registry import METHODS
 from plenocli.inverse.picture.real_light import (
-    along_the_grid,
+    EachPixel,
+    in_common,
     noise_of_parts,
     sampled,
     typical_white,
 )
 from plenocli.inverse.picture.superpixels import superpixels
+from plenocli.inverse.picture.tiles import EVERY
 from tests.reference.calibrations import drawn_calibration, lenslet_grid
 
 PITCH, COUNT, WINDOW = 12.31, (9, 10), 12
@@ -78,7 +82,7 @@ def test_superpixels_are_taken_where_the_lenslets_are(camera):
     values, tilt = rng.uniform(0.2, 1, COUNT), np.zeros(COUNT)
     tilt[2:4, 3:6] = rng.uniform(-0.5, 0.5, (2, 3))
     capture = Capture(mosaic=200.0 * drawn(centres + MOVED, shape, values, tilt))
-    found = along_the_grid(capture, system, calibration, None)
+    found = EachPixel(capture, system, calibration, None).cut(*EVERY)
     seen = np.isfinite(found.y)
     offset = np.arange(WINDOW) - (WINDOW - 1) / 2
     true = values[..., None] * (1 + tilt[..., None] * np.tile(offset, WINDOW) / 6) * even.ravel()
@@ -94,6 +98,34 @@ def test_superpixels_are_taken_where_the_lenslets_are(camera):
     assert np.all(np.isinf(found.variance) == ~seen)
 
 
+@pytest.mark.parametrize("lenslet_rows", [1, 2])
+def test_bands_in_a_file_are_those_of_one_piece(camera, tmp_path, monkeypatch, lenslet_rows):
+    calibration, system, _ = camera
+    centres, shape = lenslets()
+    rng = np.random.default_rng(6)
+    values = rng.uniform(0.2, 1, COUNT)
+    values[2, 4] = 3.0
+    mosaic = 200.0 * drawn(centres + MOVED, shape, values) + rng.standard_normal(shape)
+    capture = Capture(mosaic=mosaic, levels=Levels(white=400.0))
+    whole = EachPixel(capture, system, calibration, None).cut(*EVERY)
+    monkeypatch.setattr(real_light, "AT_ONCE", lenslet_rows * COUNT[1] * WINDOW**2)
+    monkeypatch.setattr(real_light, "MARGIN", 40)
+    most = []
+
+    def read(rows, columns):
+        most.append(rows.indices(shape[0])[1] - rows.indices(shape[0])[0])
+        return mosaic[rows, columns]
+
+    stays = replace(capture, mosaic=Plane(shape, read))
+    parts = EachPixel(stays, system, calibration, None, Scratch(tmp_path / "out.h5"))
+    assert parts.count == COUNT and max(most) < shape[0]
+    for rows, columns in (EVERY, (slice(2, 5), slice(3, 9)), (slice(8, 9), slice(0, 1))):
+        cut = parts.cut(rows, columns, (slice(0, 1), slice(0, 1)))
+        for one, other in ((cut.y, whole.y), (cut.variance, whole.variance)):
+            np.testing.assert_allclose(one, other[rows, columns], rtol=1e-9, atol=1e-12)
+        assert cut.own == (slice(0, 1), slice(0, 1))
+
+
 def test_what_counts_for_nothing_is_said(camera):
     """Masked pixels, saturated ones and dust on white."""
     calibration, system, _ = camera
@@ -104,14 +136,15 @@ def test_what_counts_for_nothing_is_said(camera):
     mask[tuple(at[2, 2])] = True
     mosaic[tuple(at[4, 4])] = 255.0
     capture = Capture(mosaic=mosaic, mask=mask, levels=Levels(white=255.0))
-    found = along_the_grid(capture, system, calibration, None)
+    found = EachPixel(capture, system, calibration, None).cut(*EVERY)
     middle = np.isfinite(found.y).reshape(*COUNT, WINDOW, WINDOW)[:, :, 5:7, 5:7].all(axis=(2, 3))
     assert not middle[2, 2] and not middle[4, 4] and middle[6, 6]
     white = np.ones((5, 5, 200)) * np.linspace(1, 2, 25).reshape(5, 5, 1)
     white = white * (1 + 0.01 * np.random.default_rng(0).standard_normal(white.shape))
     white[1, 1, 3] = 0.3
     white[3, 2, 5] = 1.2 * white[3, 2, 6]
-    own, dusty = typical_white(white, np.ones((5, 5), bool))
+    found = in_common(np.moveaxis(white, 2, 0), np.ones((5, 5), bool))
+    own, dusty = typical_white(white, found)
     assert dusty[1, 1, 3] and dusty.sum() == 1 and own[3, 2, 5] == white[3, 2, 5]
     noise = np.std(own / own.mean(axis=2, keepdims=True), axis=(0, 1))
     assert np.median(noise) < 0.004
@@ -120,7 +153,7 @@ def test_what_counts_for_nothing_is_said(camera):
 def test_other_windows_are_refused(camera):
     calibration, system, _ = camera
     with pytest.raises(InputError, match="no whole part"):
-        along_the_grid(
+        EachPixel(
             Capture(mosaic=np.zeros(lenslets()[1])),
             replace(system, pixel_shape=(5, 5)),
             calibration,
@@ -189,7 +222,7 @@ def test_a_real_capture_is_predicted_where_it_was_left_out(shared_data, tmp_path
         pixel_shape=(12, 12),
         object_shape=(12, 12),
     )
-    data = along_the_grid(capture, system, calibration, None)
+    data = EachPixel(capture, system, calibration, None).cut(*EVERY)
     part = np.s_[2:8, 9:15]
     data = replace(data, y=np.nan_to_num(data.y[part]), variance=data.variance[part])
     estimators = Estimators(

@@ -66,14 +66,14 @@ def test_it_is_the_dense_solution_with_any_pixels_missing(tmp_path, monkeypatch)
     weight[0, 1] = 0
     profile = 1 / np.sqrt(np.median(weight[weight.any(axis=2)], axis=0) + 1)
     solver = prepare_weighted(system, COVARIANCE, profile, np.eye(1), most=20)
-    found = solver.apply(y, weight, np.ones((3, 3)))
+    found = solver.apply(solver.coordinates(y, weight), np.ones((3, 3)))
     level = solver.coordinates(y, weight).around()[1, 1]
     x, sd, made = dense(system, y, weight, level)
     np.testing.assert_allclose(found.value[1, 1], x, atol=1e-8)
     np.testing.assert_allclose(found.sigma[1, 1], sd, rtol=1e-8)
     np.testing.assert_allclose(found.superpixels[1, 1], made, atol=1e-8)
     # the value of a missing pixel is nobody's business
-    other = solver.apply(np.where(weight > 0, y, 1e3), weight, np.ones((3, 3)))
+    other = solver.apply(solver.coordinates(np.where(weight > 0, y, 1e3), weight), np.ones((3, 3)))
     np.testing.assert_array_equal(other.value, found.value)
 
 

@@ -238,7 +238,7 @@ def test_superpixels_in_bands_are_those_of_all_at_once(kind, channel, monkeypatc
     )
     whole = measured(shot, stack, known, channel=channel)
     monkeypatch.setattr(superpixels, "AT_ONCE", 3500)
-    monkeypatch.setattr(superpixels, "MARGIN", 40)
+    monkeypatch.setattr(real_light, "MARGIN", 40)
     monkeypatch.setattr(real_light, "MEDIANS", 3000)
     monkeypatch.setattr("plenocli.base.tiling.BAND", 3500)
     reads = []

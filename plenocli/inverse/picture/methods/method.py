@@ -88,9 +88,9 @@ class Method(ABC):
     hindsight: whether the truth may choose its weight.
     each_pixel: whether every pixel counts by its own noise.
     in_batches: whether its lenslets are solved in batches, which processes may share.
-    in_tiles: whether large captures may be estimated tile by tile.
     weighs_all: whether one weight goes by the power, or the error, of all lenslets, which some do
         not tell.
+    lenslets_around: how many on either side its own depend on, beside what `sees` says.
     points_around: of a method that sees the whole picture, how far a point looks.
     unrestrained: whether a picture that explains its capture may be noise for the most part.
     """
@@ -104,8 +104,8 @@ class Method(ABC):
     hindsight: bool = False
     each_pixel: bool = False
     in_batches: bool = False
-    in_tiles: bool = True
     weighs_all: bool = False
+    lenslets_around: int = 0
     points_around: int = 0
     unrestrained: bool = False
 
@@ -115,11 +115,16 @@ class Method(ABC):
         return self.phases if self.sees is Sees.LENSLET_AS_IS else cleaned(self.phases)
 
     @property
+    def by_noise(self) -> bool:
+        """Whether it goes by the noise, to which that of the matrix is compared."""
+        return self.each_pixel or self.sees is not Sees.LENSLET_AS_IS
+
+    @property
     def in_threads(self) -> bool:
         """Whether threads share its tiles as well as processes, which start late and hold all that
         tiles have in common once each: it does little but multiply matrices.
         """
-        return self.sees is not Sees.PICTURE and not self.in_batches
+        return self.sees is not Sees.PICTURE and not self.in_batches and not self.each_pixel
 
     def makes_joint_estimate(self, estimators: Estimators) -> bool:
         """Whether LMMSE over 3x3 lenslets is made, before the method or instead of it."""

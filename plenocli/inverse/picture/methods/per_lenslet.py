@@ -145,10 +145,13 @@ def tikhonov(
     """
     svd, alpha, rule = estimators.svd, estimators.options.alpha, "given"
     means, z = _about_means(estimators, y)
+    common, own = light.data.common, light.counted
+    power = common("power", lambda: least_squares.power_of(z[:, own]))
     if alpha is None and truth is not None:
-        alpha, rule = least_squares.oracle_alpha(svd, z, truth - means), HINDSIGHT
+        about = z[:, own], (truth - means)[:, own]
+        cross = common("cross", lambda: least_squares.shared_with(svd, *about))
+        alpha, rule = least_squares.oracle_alpha(svd, power, cross), HINDSIGHT
     elif alpha is None:
-        power = light.data.common("power", lambda: least_squares.power_of(z[:, light.counted]))
         alpha = least_squares.discrepancy_alpha(svd, power, light.data.known_sigma)
         rule = "discrepancy"
     found = means if light.data.only_means else means + least_squares.tikhonov(svd, z, alpha)
@@ -163,10 +166,13 @@ def tsvd(
     """
     svd, rank, rule = estimators.svd, estimators.options.rank, "given"
     means, z = _about_means(estimators, y)
+    common, own = light.data.common, light.counted
+    power = common("power", lambda: least_squares.power_of(z[:, own]))
     if rank is None and truth is not None:
-        rank, rule = least_squares.oracle_rank(svd, z, truth - means), HINDSIGHT
+        about = z[:, own], (truth - means)[:, own]
+        cross = common("cross", lambda: least_squares.shared_with(svd, *about))
+        rank, rule = least_squares.oracle_rank(svd, power, cross), HINDSIGHT
     elif rank is None:
-        power = light.data.common("power", lambda: least_squares.power_of(z[:, light.counted]))
         rank = least_squares.best_rank(svd, power, light.data.known_sigma)
         rule = "least estimated error"
     rank = min(rank, svd.rank())

@@ -14,11 +14,13 @@ from plenocli.inverse.picture.footprint import Sizes, lmmse_phases
 from plenocli.inverse.picture.hold_out import HeldOut
 from plenocli.inverse.picture.lenslet_model import Superpixels
 from plenocli.inverse.picture.methods.method import Estimate, Estimator, OwnLight, Sees
-from plenocli.inverse.picture.solvers.joint_lmmse import needed_reach
+from plenocli.inverse.picture.solvers.joint_lmmse import RING, needed_reach
 from plenocli.inverse.picture.solvers.lmmse import require_noise
 from plenocli.inverse.picture.solvers.weighted_lmmse import (
+    CHUNK,
     MOST,
     SCALES,
+    Coordinates,
     WeightedLmmse,
     prepare_weighted,
 )
@@ -28,6 +30,12 @@ BRIGHTNESS = 0.2
 """Mean of the photographs that the statistics are from, about."""
 ROUNDS = 1
 """Of what the matrix does not explain and the contrast in turn."""
+LOOK = RING * (ROUNDS + 1)
+"""Lenslets on either side that one depends on: its ring, and theirs for what these leave over."""
+
+
+FEW = 3
+"""Of this many lenslets along an axis one tells means over a capture, after the first round."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,42 +72,67 @@ def weighted(estimators: Estimators, light: OwnLight) -> Estimate:
 
     Raises NumericsError where the noise is not known.
     """
-    recorded, unit = _weights(estimators, light.data), _unit(estimators, light.y)
+    data, common = light.data, light.data.common
+    recorded, unit = _weights(estimators, data), common("unit", lambda: _unit(estimators, light.y))
     y, weight = np.where(recorded > 0, light.y, 0) / unit, _rounded(recorded * unit**2)
-    solver = _prepare(estimators, light.data, weight)
+    solver = common("solver", lambda: _prepare(estimators, data, weight))
     misfit = np.ones((*y.shape[:2], 1))
-    for _ in range(ROUNDS):
-        lighter = _rounded(weight / misfit**2)
-        scale = _rounded(solver.contrasts(y, lighter))
-        made = solver.apply(y, lighter, scale, only_superpixels=True).superpixels
-        misfit = np.maximum(misfit, _left_over(solver, y, weight, made))
-    lighter = _rounded(weight / misfit**2)
-    scale = _rounded(solver.contrasts(y, lighter))
-    found = solver.apply(y, lighter, scale)
 
-    def predict(kept: np.ndarray) -> np.ndarray:
-        weight = _rounded(kept * (unit / misfit) ** 2)
-        return solver.apply(y, weight, scale, only_superpixels=True).superpixels * unit
+    def seen(number: int) -> tuple[Coordinates, np.ndarray]:
+        found = solver.coordinates(y, _rounded(weight / misfit**2))
+        counted = _own(data, 0, thin=number > 0)
+        return found, _rounded(solver.contrasts(found, common, number, counted))
 
-    share = estimators.options.hold_out
-    held_out: tuple[HeldOut, ...] = ()
-    if share:
-        held_out = hold_out.judge(
-            estimators.system,
-            y * unit,
-            recorded,
-            predict,
-            share,
-            stream(estimators.options.seed, "hold out"),
-            hold_out.PATCHES,
+    for number in range(ROUNDS):
+        near = np.argwhere(_own(data, RING * (ROUNDS - number), thin=True)).tolist()
+        made = solver.apply(*seen(number), only_superpixels=True, lenslets=near).superpixels
+        misfit = np.fmax(misfit, _left_over(solver, y, weight, made))
+    found, scale = seen(ROUNDS)
+    own = [] if _only_means(data) else np.argwhere(_own(data, 0)).tolist()
+    picture = solver.apply(found, scale, lenslets=own)
+    del found
+
+    def stats() -> WeightedStats:
+        def predict(kept: np.ndarray) -> np.ndarray:
+            left = solver.coordinates(y, _rounded(kept * (unit / misfit) ** 2))
+            return solver.apply(left, scale, only_superpixels=True).superpixels * unit
+
+        share = estimators.options.hold_out
+        held_out: tuple[HeldOut, ...] = ()
+        if share:
+            rng = stream(estimators.options.seed, "hold out")
+            held_out = hold_out.judge(
+                estimators.system, y * unit, recorded, predict, share, rng, hold_out.PATCHES
+            )
+        lit = weight.any(axis=2)
+        return WeightedStats(
+            scale=float(np.exp(np.mean(np.log(scale[lit])))) if lit.any() else 1.0,
+            misfit=float(np.median(misfit[lit])) if lit.any() else 1.0,
+            held_out=held_out,
         )
-    seen = weight.any(axis=2)
-    stats = WeightedStats(
-        scale=float(np.exp(np.mean(np.log(scale[seen])))) if seen.any() else 1.0,
-        misfit=float(np.median(misfit[seen])) if seen.any() else 1.0,
-        held_out=held_out,
+
+    told = common("told", stats)
+    return Estimate(value=picture.value * unit, sigma=picture.sigma * unit, stats=told)
+
+
+def _only_means(data: Superpixels) -> bool:
+    """Whether a piece is looked at for what it adds to means, and its picture not wanted."""
+    return data.whole is not None and data.whole.only_means
+
+
+def _own(data: Superpixels, around: int, *, thin: bool = False) -> np.ndarray:
+    """(lenslet_row, lenslet_column), a piece's own lenslets and `around` more on either side; thin:
+    a few of its own, where these are for means alone.
+    """
+    few, count = thin and _only_means(data), data.y.shape[:2]
+    around = 0 if few else around
+    ends = (part.indices(n) for part, n in zip(data.own, count))
+    rows, columns = (
+        slice(max(0, first - around), last + around, FEW if few else 1) for first, last, _ in ends
     )
-    return Estimate(value=found.value * unit, sigma=found.sigma * unit, stats=stats)
+    found = np.zeros(count, bool)
+    found[rows, columns] = True
+    return found
 
 
 def _unit(estimators: Estimators, y: np.ndarray) -> float:
@@ -160,16 +193,17 @@ def _left_over(
 
 
 def weighted_phases(n: Sizes) -> list[float]:
-    """Numbers held: every lenslet has a matrix of its coordinates, in four forms at once."""
+    """Numbers held: every lenslet has a matrix of its coordinates."""
     used, wide = min(MOST + 1, n.pixels), 2 * n.reach + 1
     ring = (9 * used) ** 2 + 9 * used * n.points
     footprints = (2 * wide**2 + (wide + 4) ** 2 + n.offsets + 18) * used * n.points
-    own = n.lenslets * (4 * used**2 + 2 * len(SCALES) * used + 8 * n.pixels + 3 * n.points)
+    own = n.lenslets * (used**2 + 4 * used + 3 * len(SCALES) + 12 * n.pixels + 3 * n.points)
+    at_once = min(n.lenslets, CHUNK) * (4 * used**2 + 4 * n.pixels)
     return [
         *lmmse_phases(n),
         n.offsets * n.pixels * n.points + 4 * n.pixels**2 + 3 * n.points**2,
         n.y + footprints + 3 * ring,
-        2 * ring + own,
+        2 * ring + own + at_once,
     ]
 
 
@@ -179,6 +213,7 @@ WEIGHTED = Estimator(
     phases=weighted_phases,
     options=("hold_out",),
     each_pixel=True,
-    in_tiles=False,
+    weighs_all=True,
+    lenslets_around=LOOK,
     estimate=weighted,
 )

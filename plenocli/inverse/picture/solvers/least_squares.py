@@ -186,22 +186,27 @@ def best_rank(svd: Svd, power: np.ndarray, sigma: float) -> int:
     return int(np.argmin(np.cumsum(change))) + 1
 
 
-def oracle_alpha(svd: Svd, z: np.ndarray, truth: np.ndarray) -> float:
+def shared_with(svd: Svd, z: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Mean product (k,) of each direction of signals z (k, signal) and of the truth (point, signal)
+    behind them.
+    """
+    return np.mean(z * (svd.vt @ truth), axis=1)
+
+
+def oracle_alpha(svd: Svd, power: np.ndarray, cross: np.ndarray) -> float:
     """The alpha with the least mean square error. It needs the truth: a bound, not a method.
 
     svd: of A.
-    z: (k, signal) U^T y.
-    truth: (point, signal).
+    power: (k,) mean square of the signals, see `power_of`.
+    cross: (k,) what they share with the truth, see `shared_with`.
 
     Returns alpha in the square of A's unit, for `tikhonov`.
     """
     from scipy.optimize import minimize_scalar
 
-    coordinates = svd.vt @ truth
-
     def error(log_alpha: float) -> float:
-        alpha = 10.0**log_alpha * svd.s[0] ** 2
-        return np.sum(((svd.s / (svd.s**2 + alpha))[:, None] * z - coordinates) ** 2)
+        gain = svd.s / (svd.s**2 + 10.0**log_alpha * svd.s[0] ** 2)
+        return float(gain**2 @ power - 2 * gain @ cross)
 
     coarse = np.arange(-14.0, 2.01, 0.5)
     best = coarse[np.argmin([error(a) for a in coarse])]
@@ -211,16 +216,14 @@ def oracle_alpha(svd: Svd, z: np.ndarray, truth: np.ndarray) -> float:
     return float(10.0**found.x * svd.s[0] ** 2)
 
 
-def oracle_rank(svd: Svd, z: np.ndarray, truth: np.ndarray) -> int:
+def oracle_rank(svd: Svd, power: np.ndarray, cross: np.ndarray) -> int:
     """The truncation with the least mean square error. It needs the truth: a bound, not a method.
 
-    svd: of A.
-    z: (k, signal) U^T y.
-    truth: (point, signal).
+    Arguments as of oracle_alpha.
 
     Returns how many directions are kept, for `truncated`.
     """
     top = svd.rank()
-    coordinates = svd.vt[:top] @ truth
-    change = np.sum((z[:top] / svd.s[:top, None] - coordinates) ** 2 - coordinates**2, axis=1)
+    gain = 1 / svd.s[:top]
+    change = gain**2 * power[:top] - 2 * gain * cross[:top]
     return int(np.argmin(np.cumsum(change))) + 1

@@ -15,10 +15,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from plenocli.inverse.picture.lenslet_model import LensletMatrix
+from plenocli.base.tiling import bands
+from plenocli.inverse.picture.lenslet_model import Common, LensletMatrix, alone
 from plenocli.inverse.picture.solvers.joint_lmmse import RING, ring_covariances
 
 MOST = 96
@@ -29,6 +31,8 @@ LEAST = 1e-10
 """Of the most that pixels say of a vector, below which they say nothing."""
 SCALES = 2.0 ** np.arange(-8, 5)
 """Factors of the scene's covariance that are tried."""
+CHUNK = 64
+"""Lenslets whose coordinates are worked out at a time."""
 ROUNDS = 10
 """Of how common each of them is, and what it is for each lenslet, in turn."""
 
@@ -98,19 +102,29 @@ class WeightedLmmse:
         y: (lenslet_row, lenslet_column, pixel).
         weight: like y, one over a pixel's variance, 0 for a pixel that counts for nothing.
         """
+        shape, used = y.shape[:2], self.basis.shape[1]
+        y, weight = (a.reshape(-1, a.shape[2]) for a in (y, weight))
+        root = np.empty((len(y), used, used))
+        seen, even, level = np.empty((len(y), used)), np.empty((len(y), used)), np.empty(len(y))
+        for some in bands(len(y), CHUNK):
+            root[some], seen[some], even[some], level[some] = self._told(y[some], weight[some])
+        return Coordinates(*(a.reshape(*shape, *a.shape[1:]) for a in (root, seen, even, level)))
+
+    def _told(self, y: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, ...]:
+        """What Coordinates hold of some lenslets; y, weight: (lenslet, pixel)."""
         share = weight * self.profile**2
         known = weight > 0
         light = np.where(known, y, 0) / self.profile * share
         white = np.where(known, self.even, 0) / self.profile * share
-        power_of_white = np.sum(white * self.even / self.profile, axis=2)
-        level = np.sum(light * self.even / self.profile, axis=2)
-        information = np.einsum("pk,rcp,pj->rckj", self.basis, share, self.basis, optimize=True)
+        power_of_white = np.sum(white * self.even / self.profile, axis=1)
+        level = np.sum(light * self.even / self.profile, axis=1)
+        information = np.einsum("pk,lp,pj->lkj", self.basis, share, self.basis, optimize=True)
         power, turn = np.linalg.eigh(information)
         least = LEAST * power.max(axis=-1, keepdims=True) + np.finfo(float).tiny
         root = np.sqrt(np.where(power > least, power, 0))
         inverse = np.where(root > 0, 1 / np.where(root > 0, root, 1), 0)
         back = turn.swapaxes(-1, -2)
-        return Coordinates(
+        return (
             (turn * root[..., None, :]) @ back,
             _each(turn, inverse * _each(back, light @ self.basis)),
             _each(turn, inverse * _each(back, white @ self.basis)),
@@ -119,8 +133,7 @@ class WeightedLmmse:
 
     def apply(
         self,
-        y: np.ndarray,
-        weight: np.ndarray,
+        found: Coordinates,
         scale: np.ndarray,
         *,
         only_superpixels: bool = False,
@@ -128,18 +141,18 @@ class WeightedLmmse:
     ) -> Ringed:
         """The picture behind superpixels.
 
-        y, weight: as in `coordinates`.
+        found: their coordinates.
         scale: (lenslet_row, lenslet_column) factor of the scene's covariance around each.
         only_superpixels: leave out the standard deviation, which takes half of the time.
         lenslets: (row, column) of those that are wanted, None for all; the others are NaN.
         """
         from scipy.linalg import cho_solve, cholesky, solve_triangular
 
-        found, (rows, columns) = self.coordinates(y, weight), y.shape[:2]
+        rows, columns = found.level.shape
         used, levels = self.basis.shape[1], found.around()
         even = self.even / self.profile @ self.basis
         x, sigma = np.full((2, rows, columns, len(self.variance)), np.nan)
-        made = np.full(y.shape, np.nan)
+        made = np.full((rows, columns, len(self.even)), np.nan)
         for r, c in np.ndindex(rows, columns) if lenslets is None else lenslets:
             near = [
                 (k, r + dr, c + dc)
@@ -167,36 +180,66 @@ class WeightedLmmse:
             sigma[r, c] = np.sqrt(np.maximum(scale[r, c] * self.variance - explained, 0))
         return Ringed(value=x, sigma=sigma, superpixels=made)
 
-    def contrasts(self, y: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    def contrasts(
+        self,
+        found: Coordinates,
+        common: Common = alone,
+        which: Any = None,
+        counted: np.ndarray | None = None,
+    ) -> np.ndarray:
         """Factors of the scene's covariance, one for each lenslet, from what it shows itself about
         its brightness: means of the logarithm, given how common each of SCALES is among all.
 
-        y, weight: as in `coordinates`.
+        found: coordinates of the superpixels.
+        common, which: give how common each is, of superpixels that are a part.
+        counted: (lenslet_row, lenslet_column), those of which it is; None for all.
 
         Returns (lenslet_row, lenslet_column), of the ring's mean where that is more; at most what
         an object has whose points are dark or as bright as the brightest lenslet of the ring.
         """
         from scipy.ndimage import maximum_filter, uniform_filter
 
-        found, used = self.coordinates(y, weight), self.basis.shape[1]
-        middle = 2 * RING * (RING + 1) * used
-        own = self.data[middle : middle + used, middle : middle + used]
-        power, turn = np.linalg.eigh(found.root @ own @ found.root)
-        rest = found.seen - found.level[..., None] * found.even
-        square = _each(turn.swapaxes(-1, -2), rest) ** 2
-        total = 1 + SCALES[:, None, None, None] * np.maximum(power, 0)
-        likely = -0.5 * np.sum(np.log(total) + square / total, axis=-1)
-        share = np.full((len(SCALES), 1, 1), 1 / len(SCALES))
+        likely = self._likelihoods(found)
         likely = np.exp(likely - likely.max(axis=0))
-        for _ in range(ROUNDS):
-            posterior = likely * share / np.sum(likely * share, axis=0)
-            share = np.maximum(posterior.mean(axis=(1, 2), keepdims=True), 1e-6)
-        mean = np.exp(np.sum(posterior * np.log(SCALES)[:, None, None], axis=0))
+        told = likely if counted is None else likely[:, counted.ravel()]
+        share = common("contrasts", lambda: _shares(told), which)
+        posterior = _given(share, likely)
+        mean = np.exp(np.sum(posterior * np.log(SCALES)[:, None], axis=0))
+        mean = mean.reshape(found.level.shape)
         mean = np.maximum(mean, uniform_filter(mean, 2 * RING + 1, mode="nearest"))
         brightest = maximum_filter(np.maximum(found.level, 0), 2 * RING + 1, mode="nearest")
         return np.clip(
             mean, SCALES[0], np.maximum(brightest**2 / 4 / self.variance.max(), SCALES[0])
         )
+
+    def _likelihoods(self, found: Coordinates) -> np.ndarray:
+        """Logarithms of how likely each of SCALES makes each lenslet, (scale, lenslet)."""
+        used = self.basis.shape[1]
+        middle = 2 * RING * (RING + 1) * used
+        own = self.data[middle : middle + used, middle : middle + used]
+        roots = found.root.reshape(-1, used, used)
+        rest = (found.seen - found.level[..., None] * found.even).reshape(-1, used)
+        likely = np.empty((len(SCALES), len(rest)))
+        for some in bands(len(rest), CHUNK):
+            power, turn = np.linalg.eigh(roots[some] @ own @ roots[some])
+            square = _each(turn.swapaxes(-1, -2), rest[some]) ** 2
+            total = 1 + SCALES[:, None, None] * np.maximum(power, 0)
+            likely[:, some] = -0.5 * np.sum(np.log(total) + square / total, axis=-1)
+        return likely
+
+
+def _shares(likely: np.ndarray) -> np.ndarray:
+    """How common each of SCALES is among lenslets, (scale,); likely: (scale, lenslet)."""
+    share = np.full(len(SCALES), 1 / len(SCALES))
+    for _ in range(ROUNDS - 1):
+        share = np.maximum(_given(share, likely).mean(axis=1), 1e-6)
+    return share
+
+
+def _given(share: np.ndarray, likely: np.ndarray) -> np.ndarray:
+    """Probabilities (scale, lenslet) of SCALES that are so common."""
+    posterior = likely * share[:, None]
+    return posterior / np.sum(posterior, axis=0)
 
 
 def prepare_weighted(

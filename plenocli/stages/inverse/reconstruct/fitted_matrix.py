@@ -4,14 +4,17 @@ what a pif that does not fit is likely to have wrong.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from plenocli.base.errors import InputError, PlenoError, UsageError
 from plenocli.base.progress import note
 from plenocli.inverse.picture.estimators import Estimators
+from plenocli.inverse.picture.tiles import Source
 from plenocli.stages.inverse.fit_camera import fitted
+from plenocli.stages.inverse.reconstruct.recipe import FittedCamera
 
 HIDDEN = 0.2
 """Neighbours' light over the noise up to which a fit does not see it."""
@@ -21,20 +24,43 @@ if TYPE_CHECKING:
     from plenocli.inverse.picture.lenslet_model import LensletMatrix, Superpixels
 
 
-def with_fitted_camera(
-    estimators: Estimators, data: Superpixels, where: Any
-) -> tuple[Estimators, CameraFit]:
-    """(the same by the matrix of the camera that fits the capture, the fit); those at hand where no
-    camera near the described one explains it, which a note says.
+def fitted_to(estimators: Estimators, source: Source, where: Path) -> FittedCamera | None:
+    """The camera that fits the middle of a capture; None where no camera near the described one
+    explains it, which a note says.
 
-    data: the capture.
-    where: its path, for messages.
+    Arguments and errors as of camera_fit.
+
+    source: of the capture's superpixels.
+    """
+    from plenocli.inverse.fit.fit import MOST_LENSLETS
+    from plenocli.inverse.fit.problem import middle_of
+
+    # a fit looks at no more
+    data = source.cut(*middle_of(source.count, MOST_LENSLETS))
+    fit, model = camera_fit(estimators, data, where)
+    if not fit.accepted:
+        note(f"--fit: the best {fit.why}; the matrix of the camera as described is used")
+        return None
+    moved = [p.name for p in fit.parameters if p.measured and abs(p.value - p.described) > p.sigma]
+    note(
+        f"--fit: {fit.why} (as described {fit.noise_ratio_before:.3g} times); "
+        f"other than described: {', '.join(moved) or 'nothing'}"
+    )
+    return FittedCamera(camera=fit.camera, model=model)
+
+
+def camera_fit(
+    estimators: Estimators, data: Superpixels, where: str | Path
+) -> tuple[CameraFit, str]:
+    """(the fit of the described camera to a capture, by which model of propagation).
+
+    estimators: by the matrix of the described camera.
+    where: path of the capture, for messages.
 
     Raises UsageError where the pif does not say what camera it was made for, or the camera is of a
     kind that is not fitted; InputError where the noise is not known.
     """
     from plenocli.inverse.fit.problem import CapturedLenslets
-    from plenocli.inverse.picture.trust.finer import matrix_of
 
     system, options = estimators.system, estimators.options
     if system.origin is None:
@@ -57,15 +83,7 @@ def with_fitted_camera(
         model=model,
         seed=options.seed,
     )
-    if not fit.accepted:
-        note(f"--fit: the best {fit.why}; the matrix of the camera as described is used")
-        return estimators, fit
-    moved = [p.name for p in fit.parameters if p.measured and abs(p.value - p.described) > p.sigma]
-    note(
-        f"--fit: {fit.why} (as described {fit.noise_ratio_before:.3g} times); "
-        f"other than described: {', '.join(moved) or 'nothing'}"
-    )
-    return estimators.with_matrix(matrix_of(system, fit.camera, model)), fit
+    return fit, model
 
 
 def _neighbours_count(system: LensletMatrix, data: Superpixels, sigma: float) -> UsageError:

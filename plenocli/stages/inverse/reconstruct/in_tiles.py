@@ -23,11 +23,11 @@ from plenocli.inverse.picture.estimate import estimate
 from plenocli.inverse.picture.estimators import Estimators
 from plenocli.inverse.picture.footprint import pieces_at_once, require_reconstruction
 from plenocli.inverse.picture.lenslet_model import Superpixels, Whole
-from plenocli.inverse.picture.methods.method import Sees
 from plenocli.inverse.picture.methods.registry import METHODS
 from plenocli.inverse.picture.reconstruction import Reconstruction
 from plenocli.inverse.picture.tiles import (
     NUISANCES,
+    Area,
     Source,
     Tile,
     joined,
@@ -36,10 +36,18 @@ from plenocli.inverse.picture.tiles import (
     spread_over,
     survey,
 )
-from plenocli.stages.inverse.reconstruct.fitted_matrix import likely_cause
-from plenocli.stages.inverse.reconstruct.recipe import Recipe, estimators_of, finer_of
+from plenocli.stages.inverse.reconstruct.fitted_matrix import fitted_to, likely_cause
+from plenocli.stages.inverse.reconstruct.recipe import (
+    Matrix,
+    Recipe,
+    estimators_by,
+    estimators_of,
+    field_of,
+    finer_of,
+)
 from plenocli.stages.inverse.reconstruct.solved import Solved
 from plenocli.stages.inverse.reconstruct.tiles import SolvedTile, picture, solve_all
+from plenocli.stages.inverse.reconstruct.truth import truth_of
 
 if TYPE_CHECKING:
     from plenocli.forward.accuracy.limiting_error import Limits
@@ -119,41 +127,40 @@ class _Typical:
         cls, recipe: Recipe, capture: Path, source: Source, tiles: Sequence[Tile], target: Path
     ) -> _Typical:
         """Of a capture whose tiles fit the memory. Raises NumericsError."""
-        estimators = estimators_of(recipe)
-        method, system = METHODS[recipe.settings.method], estimators.system
-        look = method.sees is not Sees.LENSLET_AS_IS
-
-        def described() -> dict[str, Any]:
-            if look:  # what all that follows needs is made while the survey waits for the file
-                estimators.prior.pictures(source.cut(slice(0, 1), slice(0, 1)).scene)
-                estimators.svd  # noqa: B018
-            return describe_capture(capture)
-
-        (whole, middle), about = both(lambda: survey(system, source, side_of(system)), described)
-        data = source.cut(*middle.own)
-        most = max(math.prod(part.stop - part.start for part in tile.around) for tile in tiles)
+        method, described = METHODS[recipe.settings.method], estimators_of(recipe)
         require_reconstruction(
-            estimators,
-            most,
-            data.sigma,
+            described,
+            max(math.prod(part.stop - part.start for part in tile.around) for tile in tiles),
+            source.cut(slice(1), slice(1)).sigma,
             capture,
             method.all_phases,
-            joint=method.makes_joint_estimate(estimators),
+            joint=method.makes_joint_estimate(described),
         )
-        limits, finer = limits_of(estimators, data), False
-        if look and limits is not None and limits.limited_by == "model":
-            better = finer_of(recipe)
-            finer, estimators = better is not None, better or estimators
-            limits = limits_of(estimators, data)
-        off = error_that_counts(limits)
+        matrix = matrix_of_capture(recipe, source, capture)
+        asked = estimators_by(recipe, matrix)
+        system = asked.system
+
+        def about_capture() -> dict[str, Any]:
+            if method.by_noise:  # what all that follows needs is made while the survey waits
+                asked.prior.pictures(source.cut(slice(1), slice(1)).scene)
+                asked.svd  # noqa: B018
+            return describe_capture(capture)
+
+        (whole, middle), about = both(
+            lambda: survey(system, source, side_of(system)), about_capture
+        )
+        data = source.cut(*middle.own)
+        matrix, limits = matrix_that_serves(recipe, matrix, data)
+        estimators, off = estimators_by(recipe, matrix), error_that_counts(limits)
         declared = data.saturated is not None
         data, cause = replace(data, whole=whole), partial(likely_cause, estimators)
-        found, seen = estimate(estimators, method, data, model_error=off, explain=cause)
+        truth = _true_objects(recipe, source, middle.own)
+        found, seen = estimate(estimators, method, data, truth, model_error=off, explain=cause)
         task = _TileTask(
             recipe=recipe,
             capture=capture,
             target=target,
-            finer=finer,
+            matrix=matrix,
             model_error=off,
             whole=whole,
         )
@@ -167,7 +174,7 @@ class _TileTask:
     """The task of a tile, in any process; what they share is made once a process.
 
     target: beside which a capture that cannot be read in parts is decoded.
-    finer: whether by a finer matrix of the camera.
+    matrix: by which.
     model_error: of the matrix, see estimate.
     whole: what is known of the capture.
     """
@@ -175,7 +182,7 @@ class _TileTask:
     recipe: Recipe
     capture: Path
     target: Path
-    finer: bool
+    matrix: Matrix
     model_error: float
     whole: Whole
 
@@ -209,14 +216,50 @@ class _TileTask:
     def _estimated(self, tile: Tile, whole: Whole) -> Reconstruction:
         """A piece; what there is to say was said of the whole."""
         recipe = self.recipe
-        estimators = (finer_of(recipe) if self.finer else None) or estimators_of(recipe)
+        estimators = estimators_by(recipe, self.matrix)
         method, system = METHODS[recipe.settings.method], estimators.system
         with collected_notes():
-            with superpixel_source(
-                self.capture, system, recipe.calibration, beside=self.target, verify=False
-            ) as source:
-                data = replace(source.cut(*tile.around, tile.within), whole=whole)
-            return estimate(estimators, method, data, model_error=self.model_error)[0]
+            source = superpixel_source(
+                self.capture,
+                system,
+                recipe.calibration,
+                each_pixel=method.each_pixel,
+                beside=self.target,
+                verify=False,
+            )
+            data = replace(source.cut(*tile.around, tile.within), whole=whole)
+            truth = _true_objects(recipe, source, tile.around)
+            return estimate(estimators, method, data, truth, model_error=self.model_error)[0]
+
+
+def _true_objects(recipe: Recipe, source: Source, area: Area) -> np.ndarray | None:
+    """Those of some lenslets, where a person gave them."""
+    known = truth_of(recipe, source.count)
+    return None if known is None else known.cut(*area)
+
+
+def matrix_of_capture(recipe: Recipe, source: Source, capture: Path) -> Matrix:
+    """The matrix that a person asked for: the pif's, or that of the camera that fits the capture.
+
+    Raises as fitted_to.
+    """
+    if not recipe.settings.fit:
+        return "told"
+    return fitted_to(estimators_of(recipe), source, capture) or "told"
+
+
+def matrix_that_serves(
+    recipe: Recipe, matrix: Matrix, data: Superpixels
+) -> tuple[Matrix, Limits | None]:
+    """(the same, or a finer one where the pif's is off by more than the noise and it can be had;
+    what limits the capture by it).
+    """
+    limits = limits_of(estimators_by(recipe, matrix), data)
+    by_noise = METHODS[recipe.settings.method].by_noise
+    off = by_noise and limits is not None and limits.limited_by == "model"
+    if matrix != "told" or not off or field_of(recipe) is not None or finer_of(recipe) is None:
+        return matrix, limits
+    return "finer", limits_of(estimators_by(recipe, "finer"), data)
 
 
 def error_that_counts(limits: Limits | None) -> float:

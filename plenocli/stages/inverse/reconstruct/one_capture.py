@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from plenocli.base.errors import InputError, UsageError
+from plenocli.base.errors import UsageError
 from plenocli.base.progress import note
-from plenocli.base.tiling import Plane, bands, to_blocks
+from plenocli.base.tiling import Plane, bands
 from plenocli.execution.pool import InProcess, Pool
 from plenocli.files.read.calibrations import read_white
 from plenocli.files.read.captures import describe_capture, room_beside, superpixel_source
@@ -25,7 +25,7 @@ from plenocli.inverse.picture.estimate import estimate
 from plenocli.inverse.picture.estimators import Estimators
 from plenocli.inverse.picture.footprint import require_reconstruction
 from plenocli.inverse.picture.lenslet_model import Superpixels
-from plenocli.inverse.picture.methods.method import Method, Sees
+from plenocli.inverse.picture.methods.method import Method
 from plenocli.inverse.picture.methods.registry import METHODS
 from plenocli.inverse.picture.reconstruction import Choice, Reconstruction
 from plenocli.inverse.picture.superpixels import windows_of
@@ -34,20 +34,22 @@ from plenocli.inverse.picture.tiles import (
     tiles_of,
 )
 from plenocli.stages.inverse.reconstruct.field_classes import estimate_by_class
-from plenocli.stages.inverse.reconstruct.fitted_matrix import likely_cause, with_fitted_camera
+from plenocli.stages.inverse.reconstruct.fitted_matrix import likely_cause
 from plenocli.stages.inverse.reconstruct.in_tiles import (
     error_that_counts,
-    limits_of,
+    matrix_of_capture,
+    matrix_that_serves,
     picture_in_tiles,
 )
 from plenocli.stages.inverse.reconstruct.recipe import (
     Recipe,
     Settings,
+    estimators_by,
     estimators_of,
     field_of,
-    finer_of,
 )
 from plenocli.stages.inverse.reconstruct.solved import Solved
+from plenocli.stages.inverse.reconstruct.truth import truth_of
 
 if TYPE_CHECKING:
     from plenocli.forward.accuracy.limiting_error import Limits
@@ -79,15 +81,20 @@ def reconstruct_capture(
         return _solved(found, settings, capture, rgb=rgb)
     estimators, method = estimators_of(recipe), METHODS[settings.method]
     system = estimators.system
-    with superpixel_source(
+    source = superpixel_source(
         capture, system, recipe.calibration, each_pixel=method.each_pixel, beside=where
-    ) as source:
-        tiles = tiles_of(estimators, method, source.count)
-        apart = len(tiles) > 1 and not settings.fit and settings.truth is None
-        if apart and field_of(recipe) is None and where is not None:
-            return picture_in_tiles(recipe, capture, source, tiles, pool or InProcess(), where)
-        data = source.cut(*EVERY)
-    look = method.sees is not Sees.LENSLET_AS_IS
+    )
+    tiles = tiles_of(estimators, method, source.count)
+    field = field_of(recipe)
+    if settings.fit and field is not None:
+        raise UsageError(
+            "a camera is fitted by the matrix of one lenslet, not by those of a whole array",
+            "--fit",
+            "leave it out, or fit the camera first with fit-camera",
+        )
+    if len(tiles) > 1 and field is None and where is not None:
+        return picture_in_tiles(recipe, capture, source, tiles, pool or InProcess(), where)
+    data = source.cut(*EVERY)
     require_reconstruction(
         estimators,
         data.y.shape[0] * data.y.shape[1],
@@ -96,23 +103,10 @@ def reconstruct_capture(
         method.all_phases,
         joint=method.makes_joint_estimate(estimators),
     )
-    count = data.y.shape[:2]
-    truth = _truth(settings.truth, system.object_shape, count, max(1, len(system.bands)))
-    field, fitted = field_of(recipe), False
-    if settings.fit and field is not None:
-        raise UsageError(
-            "a camera is fitted by the matrix of one lenslet, not by those of a whole array",
-            "--fit",
-            "leave it out, or fit the camera first with fit-camera",
-        )
-    if settings.fit:
-        estimators, fit = with_fitted_camera(estimators, data, capture)
-        fitted = fit.accepted
-    limits = limits_of(estimators, data)
-    plain = (look or method.each_pixel) and not fitted and field is None
-    if plain and limits is not None and limits.limited_by == "model":
-        estimators = finer_of(recipe) or estimators
-        limits = limits_of(estimators, data)
+    known = truth_of(recipe, source.count)
+    truth = None if known is None else known.cut(*EVERY)
+    matrix, limits = matrix_that_serves(recipe, matrix_of_capture(recipe, source, capture), data)
+    estimators = estimators_by(recipe, matrix)
     found, seen = _estimate(field, estimators, method, data, truth, limits)
     return _solved(
         found.as_picture(system.object_shape),
@@ -158,45 +152,6 @@ def _solved(found: Reconstruction, settings: Settings, capture: Path, **more: An
         negative_share=float(np.mean(picture < 0)),
         **more,
     )
-
-
-def _truth(
-    path: Path | None, shape: tuple[int, int], count: tuple[int, ...], bands: int
-) -> np.ndarray | None:
-    """The true blocks (lenslet_row, lenslet_column, point) from a capture that holds its scene,
-    an image .h5 or an EXR; or None.
-    """
-    if path is None:
-        return None
-    path = Path(path)
-    if path.suffix == ".h5":
-        from plenocli.files.artefacts.reading import read_artefact
-
-        artefact = read_artefact(path, ("capture", "image"))
-        picture = artefact.data.get("capture/scene", artefact.data.get("image/value"))
-    else:
-        from plenocli.files.images.pictures import read_picture
-
-        picture = np.moveaxis(read_picture(path).values, -1, 0)
-    if picture is None:
-        raise InputError("holds no scene", path, "give a simulated capture, or an image")
-    picture = np.asarray(picture, float)
-    picture = (
-        picture.mean(axis=0, keepdims=True)
-        if picture.ndim == 3 and bands == 1
-        else picture.reshape(-1, *picture.shape[-2:])
-    )
-    expected = (bands, count[0] * shape[0], count[1] * shape[1])
-    if picture.shape != expected:
-        raise InputError(
-            (
-                f"has {' x '.join(map(str, picture.shape))} bands, rows and columns of points, the "
-                f"picture {' x '.join(map(str, expected))}"
-            ),
-            path,
-            "give the object as sampled (capture-sim --scene-out)",
-        )
-    return to_blocks(picture, shape)
 
 
 def _white_normalised(

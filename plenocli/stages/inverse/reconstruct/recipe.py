@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from plenocli.files.read.system_matrices import (
     read_lenslet_matrix,
 )
 from plenocli.files.read.training import read_training
+from plenocli.forward.camera.model import Camera
 from plenocli.inverse.picture.estimators import Estimators, Options
 from plenocli.inverse.picture.lenslet_model import LensletMatrix
 
@@ -111,7 +112,12 @@ def recipe_of(
     from plenocli.files.artefacts.provenance import describe_inputs
 
     files = describe_inputs(
-        {"pif": pif, "calibration": calibration, "dictionary": settings.dictionary}
+        {
+            "pif": pif,
+            "calibration": calibration,
+            "dictionary": settings.dictionary,
+            "truth": settings.truth,
+        }
     )
     recipe = Recipe(
         settings=settings,
@@ -166,6 +172,40 @@ def field_of(recipe: Recipe) -> FieldMatrix | None:
     return None if recipe.pif is None else read_field_matrix(recipe.pif, by_band=True)
 
 
+@dataclass(frozen=True, kw_only=True)
+class FittedCamera:
+    """A camera that was fitted to a capture.
+
+    model: of propagation behind which the capture is believed to have come about.
+    """
+
+    camera: Camera
+    model: str
+
+
+Matrix = FittedCamera | Literal["told", "finer"]
+"""Which matrix pictures are estimated with: the pif's, a finer one of its camera, that of another
+camera.
+"""
+
+
+def estimators_by(recipe: Recipe, matrix: Matrix) -> Estimators:
+    """What all captures of a recipe share, by a matrix. That of a camera that was fitted takes some
+    seconds once a process, and raises as plenocli.inverse.picture.trust.finer.matrix_of.
+    """
+    if isinstance(matrix, FittedCamera):
+        return _fitted(recipe, matrix)
+    return (finer_of(recipe) if matrix == "finer" else None) or estimators_of(recipe)
+
+
+@lru_cache(maxsize=1)
+def _fitted(recipe: Recipe, to: FittedCamera) -> Estimators:
+    from plenocli.inverse.picture.trust.finer import matrix_of
+
+    described = estimators_of(recipe)
+    return described.with_matrix(matrix_of(described.system, to.camera, to.model))
+
+
 @lru_cache(maxsize=1)
 def finer_of(recipe: Recipe) -> Estimators | None:
     """The same by a finer matrix of the camera, where it can be had."""
@@ -174,6 +214,12 @@ def finer_of(recipe: Recipe) -> Estimators | None:
     rough = estimators_of(recipe)
     system = finer_matrix(rough.system)
     return None if system is None else rough.with_matrix(system)
+
+
+def forget() -> None:
+    """Let go of what captures shared."""
+    for shared in (estimators_of, finer_of, field_of, _fitted):
+        shared.cache_clear()
 
 
 def solve_in_pool(

@@ -21,13 +21,13 @@ from plenocli.stages.inverse.reconstruct.one_capture import reconstruct_capture
 from plenocli.stages.inverse.reconstruct.recipe import (
     Settings,
     estimators_of,
-    field_of,
-    finer_of,
+    forget,
     recipe_of,
     solve_in_pool,
     system_of,
 )
 from plenocli.stages.inverse.reconstruct.solved import PictureSummary, ReconstructSummary, Solved
+from plenocli.stages.inverse.reconstruct.truth import truth_of
 from plenocli.stages.inverse.reconstruct.write import write_picture
 
 
@@ -71,7 +71,7 @@ def run_reconstruct(
     if not batch.todo:
         return _summary(summarise(batch, ()))
     method = METHODS[settings.method]
-    split = not batch.several and (method.in_batches or method.in_tiles)
+    split = not batch.several
     workers = settings.workers if split else min(settings.workers, len(batch.todo))
     pooled = scheduler is not None or workers > 1
     recipe = recipe_of(settings, pif, calibration, pooled, elsewhere=scheduler is not None)
@@ -99,9 +99,8 @@ def run_reconstruct(
             done = outcomes(batch, InProcess() if split else pool, work, write)
             return _summary(summarise(batch, done))
     finally:
-        estimators_of.cache_clear()
-        finer_of.cache_clear()
-        field_of.cache_clear()
+        forget()
+        truth_of.cache_clear()
         forget_captures()
 
 

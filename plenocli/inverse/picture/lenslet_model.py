@@ -251,15 +251,6 @@ class Superpixels:
         """Whether a piece is looked at for what it adds to means over pieces alone."""
         return self.whole is not None and self.whole.only_means
 
-    def cut(self, rows: slice, columns: slice, own: tuple[slice, slice]) -> Superpixels:
-        """Those of some lenslets, of which `own` count."""
-        saturated, variance = (
-            None if values is None else values[rows, columns]
-            for values in (self.saturated, self.variance)
-        )
-        y = self.y[rows, columns]
-        return replace(self, y=y, saturated=saturated, variance=variance, own=own)
-
     @property
     def sigma(self) -> float | None:
         """Standard deviation of the known noise, in units of A x."""

@@ -32,8 +32,6 @@ ROUNDS = 1
 """Of what the matrix does not explain and the contrast in turn."""
 LOOK = RING * (ROUNDS + 1)
 """Lenslets on either side that one depends on: its ring, and theirs for what these leave over."""
-
-
 FEW = 3
 """Of this many lenslets along an axis one tells means over a capture, after the first round."""
 
@@ -88,7 +86,7 @@ def weighted(estimators: Estimators, light: OwnLight) -> Estimate:
         made = solver.apply(*seen(number), only_superpixels=True, lenslets=near).superpixels
         misfit = np.fmax(misfit, _left_over(solver, y, weight, made))
     found, scale = seen(ROUNDS)
-    own = [] if _only_means(data) else np.argwhere(_own(data, 0)).tolist()
+    own = [] if data.only_means else np.argwhere(_own(data, 0)).tolist()
     picture = solver.apply(found, scale, lenslets=own)
     del found
 
@@ -115,16 +113,11 @@ def weighted(estimators: Estimators, light: OwnLight) -> Estimate:
     return Estimate(value=picture.value * unit, sigma=picture.sigma * unit, stats=told)
 
 
-def _only_means(data: Superpixels) -> bool:
-    """Whether a piece is looked at for what it adds to means, and its picture not wanted."""
-    return data.whole is not None and data.whole.only_means
-
-
 def _own(data: Superpixels, around: int, *, thin: bool = False) -> np.ndarray:
     """(lenslet_row, lenslet_column), a piece's own lenslets and `around` more on either side; thin:
     a few of its own, where these are for means alone.
     """
-    few, count = thin and _only_means(data), data.y.shape[:2]
+    few, count = thin and data.only_means, data.y.shape[:2]
     around = 0 if few else around
     ends = (part.indices(n) for part, n in zip(data.own, count))
     rows, columns = (

@@ -5,12 +5,16 @@ import math
 import numpy as np
 import pytest
 
-from plenocli.base.errors import InputError
+from plenocli.base.errors import InputError, NumericsError
 from plenocli.base.tiling import to_blocks
 from plenocli.cli.main import run
+from plenocli.files.artefacts.container import Artefact
 from plenocli.files.artefacts.reading import read_artefact
 from plenocli.files.artefacts.shards import read_field, read_pif
+from plenocli.files.artefacts.writing import write_artefact
 from plenocli.files.config.camera_file import to_toml
+from plenocli.inverse.picture import tiles
+from plenocli.stages.inverse.reconstruct import field_classes
 from tests.forward.propagation.cameras import small_camera
 
 COUNT = 13
@@ -114,3 +118,57 @@ def test_files_that_were_changed_are_told(folder, tmp_path):
     (tmp_path / "field.001.h5").write_bytes((tmp_path / "field.000.h5").read_bytes())
     with pytest.raises(InputError, match="is not the file that field.h5 was written with"):
         read_field(tmp_path / "field.h5")
+
+
+def lmmse(folder, out, *more):
+    """Words of a command, and what its file holds once it ran."""
+    words = ["reconstruct", str(folder / "capture.h5"), "--pif", str(folder / "field.h5")]
+    assert run([*words, "--method", "lmmse", *more, "-o", str(out)]) == 0
+    return read_artefact(out, "image")
+
+
+def test_classes_are_no_larger_than_a_tile_and_go_on_from_those_that_are_finished(
+    folder, tmp_path, monkeypatch
+):
+    """By two workers the same, and as good as larger ones."""
+    truth = np.squeeze(read_artefact(folder / "capture.h5").data["capture/scene"]).astype(float)
+    large = lmmse(folder, tmp_path / "large.h5")
+    monkeypatch.setattr(tiles, "AT_ONCE", 9 * (13**2 + 8**2 + tiles.FURTHER))
+    one, two = (lmmse(folder, tmp_path / f"{n}.h5", "--workers", n) for n in "12")
+    for name, values in one.data.items():
+        np.testing.assert_array_equal(two.data[name], values)
+    off = [np.sqrt(np.mean((p.data["image/value"] - truth) ** 2)) for p in (large, one)]
+    assert off[1] == pytest.approx(off[0], rel=0.02)
+    solved, solve = [], field_classes._ClassTask.__call__
+
+    def counted(self, job):
+        if len(solved) == 5 and not resumed:
+            raise NumericsError("the power went off")
+        solved.append(job[0])
+        return solve(self, job)
+
+    monkeypatch.setattr(field_classes._ClassTask, "__call__", counted)
+    resumed = False
+    with pytest.raises(AssertionError):
+        lmmse(folder, tmp_path / "out.h5")
+    assert len(list(tmp_path.glob(".out.h5.*.tiles/*"))) == 6  # that in the middle comes first
+    resumed = True
+    again = lmmse(folder, tmp_path / "out.h5")
+    middle = set(range(25)) - set(solved)
+    assert middle == {12} and len(solved) == 24
+    for name, values in one.data.items():
+        np.testing.assert_array_equal(again.data[name], values)
+
+
+def test_what_is_found_in_any_class_is_counted(folder, tmp_path, capsys):
+    made = read_artefact(folder / "capture.h5")
+    mosaic = made.data["capture/mosaic"].copy()
+    mosaic[[7, 80, 160], [5, 84, 150]] *= 3
+    data = made.data | {"capture/mosaic": mosaic}
+    hot = Artefact(made.kind, data, made.attrs, made.provenance)
+    write_artefact(tmp_path / "capture.h5", hot)
+    words = ["reconstruct", str(tmp_path / "capture.h5"), "--pif", str(folder / "field.h5")]
+    assert run([*words, "--method", "lmmse", "-o", str(tmp_path / "out.h5")]) == 0
+    told = read_artefact(tmp_path / "out.h5").attrs["image"]["parameters"]["defects"]
+    assert told["bright"] == 3 and told["pixels"] == mosaic.size
+    assert "3 of" in capsys.readouterr().err

@@ -5,24 +5,41 @@ the matrix of its middle.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from plenocli.base.progress import bar, note
+from plenocli.base.errors import UsageError
+from plenocli.base.progress import collected_notes, note
+from plenocli.execution.pool import Pool
+from plenocli.files.read.captures import describe_capture, superpixel_source
+from plenocli.inverse.picture.diagnosis import Seen
 from plenocli.inverse.picture.estimate import estimate
+from plenocli.inverse.picture.footprint import require_reconstruction
+from plenocli.inverse.picture.lenslet_model import Whole
 from plenocli.inverse.picture.methods.registry import METHODS
+from plenocli.inverse.picture.reconstruction import Reconstruction
+from plenocli.inverse.picture.tiles import EVERY, Source, Tile, side_of, survey
+from plenocli.stages.inverse.reconstruct.in_tiles import (
+    error_that_counts,
+    matrix_that_serves,
+    true_objects,
+)
+from plenocli.stages.inverse.reconstruct.recipe import Recipe, estimators_of, field_of
+from plenocli.stages.inverse.reconstruct.solved import Solved
+from plenocli.stages.inverse.reconstruct.tiles import (
+    SolvedTile,
+    bench_of,
+    keep,
+    put_together,
+    solve_all,
+)
 
 if TYPE_CHECKING:
     from plenocli.files.read.system_matrices import FieldMatrix
     from plenocli.forward.accuracy.field_nodes import Place
-    from plenocli.inverse.picture.diagnosis import Seen
-    from plenocli.inverse.picture.estimators import Estimators
-    from plenocli.inverse.picture.lenslet_model import Superpixels
-    from plenocli.inverse.picture.methods.method import Method
-    from plenocli.inverse.picture.reconstruction import Reconstruction
 
 LEAST = 3
 """Lenslets along a class's side, at least."""
@@ -30,105 +47,152 @@ MARGIN = 6
 """Lenslets around a class that are looked at with it."""
 
 
-@dataclass(frozen=True)
-class _Class:
-    """A square of lenslets: `own` (rows, columns) of the array, `around` with its margin, and
-    `within` those its own are found again.
+def picture_by_class(
+    recipe: Recipe, capture: Path, source: Source, pool: Pool, target: Path | None
+) -> Solved:
+    """The picture of a capture by the matrices of a whole array, each class of lenslets by that of
+    its middle; the one in the middle of the array chooses the method.
+
+    target: as of bench_of.
+
+    Raises UsageError where a camera is to be fitted.
     """
-
-    own: tuple[slice, slice]
-    around: tuple[slice, slice]
-    within: tuple[slice, slice]
-
-    def place(self, count: tuple[int, int], pitch: float) -> Place:
-        """Of its middle, m from the middle of the array."""
-        row, column = ((part.start + part.stop - n) / 2 * pitch for part, n in zip(self.own, count))
-        return row, column
-
-
-def estimate_by_class(
-    field: FieldMatrix,
-    estimators: Estimators,
-    method: Method,
-    data: Superpixels,
-    truth: np.ndarray | None,
-    *,
-    tolerance: float,
-    model_error: float,
-) -> tuple[Reconstruction, Seen | None]:
-    """As estimate, every class of lenslets by the matrix of its middle; the one in the middle of
-    the array chooses the method.
-
-    estimators: of the matrix on the axis.
-    tolerance: relative change of a matrix that a class may hold.
-    """
-    count = data.y.shape[0], data.y.shape[1]
-    side, change = _fewest(field, count, tolerance)
-    off = math.hypot(model_error, change) if change > tolerance else model_error
-    classes = list(_classes(count, side))
+    settings, field, on_axis = recipe.settings, field_of(recipe), estimators_of(recipe)
+    assert field is not None
+    if settings.fit:
+        raise UsageError(
+            "a camera is fitted by the matrix of one lenslet, not by those of a whole array",
+            "--fit",
+            "leave it out, or fit the camera first with fit-camera",
+        )
+    count, most, system = source.count, side_of(on_axis.system), on_axis.system
+    is_small = count[0] * count[1] <= most**2
+    sample = source.cut(*(EVERY if is_small else survey(system, source, most)[1].own))
+    _, limits = matrix_that_serves(recipe, "told", sample)
+    tolerance = max(0.0 if limits is None else limits.noise, field.nodes.error)
+    classes, change = _fewest(field, count, tolerance, most)
+    off, method = error_that_counts(limits), METHODS[settings.method]
     note(f"{len(classes)} classes of lenslets, each by the matrix of its middle")
-    classes.sort(key=lambda c: np.hypot(*c.place(count, 1.0)))
-    whole: Reconstruction | None = None
-    seen: Seen | None = None
-    for each in bar(classes, len(classes), "classes of lenslets"):
-        own = estimators.with_matrix(field.at(each.place(count, field.pitch)))
-        part = None if truth is None else truth[each.around]
-        found, sees = estimate(own, method, _cut(data, each), part, model_error=off, guard=False)
-        if whole is None:
-            method, seen = METHODS[found.method], sees
-            shape = (*count, found.value.shape[2])
-            sigma = None if found.sigma is None else np.empty(shape)
-            whole = replace(found, value=np.empty(shape), sigma=sigma)
-        whole.value[each.own] = found.value[each.within]
-        if whole.sigma is not None and found.sigma is not None:
-            whole.sigma[each.own] = found.sigma[each.within]
-    assert whole is not None
-    return whole, seen
+    require_reconstruction(
+        on_axis,
+        max(math.prod(part.stop - part.start for part in each.around) for each in classes),
+        sample.sigma,
+        capture,
+        method.all_phases,
+        joint=method.makes_joint_estimate(on_axis),
+    )
+    task = _ClassTask(
+        recipe=recipe,
+        capture=capture,
+        target=target,
+        count=count,
+        method=settings.method,
+        model_error=math.hypot(off, change) if change > tolerance else off,
+    )
+    places = [math.hypot(*place_of(each, count, 1.0)) for each in classes]
+    middle = int(np.argmin(places))
+    found, seen = task.estimated(source, classes[middle])
+    task, about = replace(task, method=found.method), describe_capture(capture)
+    bench = bench_of(target, (replace(settings, workers=1), recipe.digests, about, classes))
+    keep(bench, middle, _own(found, classes[middle]), clip=settings.clip)
+    solve_all(pool, task, classes, bench, clip=settings.clip)
+    declared = sample.saturated is not None
+    return put_together(
+        found, bench, classes, system, declared=declared, capture=about, seen=seen, limits=limits
+    )
 
 
-def _fewest(field: FieldMatrix, count: tuple[int, int], tolerance: float) -> tuple[int, float]:
-    """The fewest classes along an axis that hold no more than the tolerance at the array's corner,
-    where matrices change most, and what they hold.
+@dataclass(frozen=True, kw_only=True)
+class _ClassTask:
+    """The task of a class, in any process.
+
+    count: lenslets (rows, columns) of the array.
+    method: by which.
+    target, model_error: as of tiles.
     """
-    most, change = max(1, max(count) // LEAST), 0.0
-    for side in range(1, most + 1):
-        corner = next(_classes(count, side))
-        middle = corner.place(count, field.pitch)
+
+    recipe: Recipe
+    capture: Path
+    target: Path | None
+    count: tuple[int, int]
+    method: str
+    model_error: float
+
+    def __call__(self, job: tuple[int, Tile]) -> SolvedTile:
+        """A class; what there is to say was said of that in the middle."""
+        recipe, method = self.recipe, METHODS[self.method]
+        with collected_notes():
+            source = superpixel_source(
+                self.capture,
+                estimators_of(recipe).system,
+                recipe.calibration,
+                each_pixel=method.each_pixel,
+                beside=self.target,
+                verify=False,
+            )
+            return _own(self.estimated(source, job[1])[0], job[1])
+
+    def estimated(self, source: Source, each: Tile) -> tuple[Reconstruction, Seen | None]:
+        """The picture of a class and its margin, and what is seen of it."""
+        field = field_of(self.recipe)
+        assert field is not None
+        own = estimators_of(self.recipe).with_matrix(
+            field.at(place_of(each, self.count, field.pitch))
+        )
+        data = replace(source.cut(*each.around, each.within), whole=Whole({}))
+        truth, off = true_objects(self.recipe, source, each.around), self.model_error
+        return estimate(own, METHODS[self.method], data, truth, model_error=off, guard=False)
+
+
+def _own(found: Reconstruction, each: Tile) -> SolvedTile:
+    """What the lenslets of a class itself show."""
+    sigma = None if found.sigma is None else found.sigma[each.within]
+    value = found.value[each.within]
+    return SolvedTile(value=value, sigma=sigma, trace=found.trace, stats=found.stats)
+
+
+def place_of(each: Tile, count: tuple[int, int], pitch: float) -> Place:
+    """Of a class's middle, m from the middle of the array of `count` lenslets (rows, columns)."""
+    row, column = ((part.start + part.stop - n) / 2 * pitch for part, n in zip(each.own, count))
+    return row, column
+
+
+def _fewest(
+    field: FieldMatrix, count: tuple[int, int], tolerance: float, largest: int
+) -> tuple[list[Tile], float]:
+    """The fewest classes, of `largest` lenslets on a side at most, that hold no more than the
+    tolerance at the array's corner, where matrices change most, and what they hold.
+    """
+    least = -(-max(count) // largest)
+    most, change = max(least, max(count) // LEAST), 0.0
+    for side in range(least, most + 1):
+        classes = _classes(count, side)
+        middle = place_of(classes[0], count, field.pitch)
         edge = tuple(-(n - 1) / 2 * field.pitch for n in count)
         here, there = field.at(middle).own, field.at((edge[0], edge[1])).own
         change = float(np.linalg.norm(there - here) / np.linalg.norm(here))
         if change <= tolerance:
-            return side, change
+            return classes, change
     note(
         f"even classes of {LEAST}x{LEAST} lenslets hold changes of {change:.1g} of a matrix, more "
         f"than {tolerance:.1g}"
     )
-    return most, change
+    return classes, change
 
 
-def _classes(count: tuple[int, int], side: int) -> Iterator[_Class]:
-    """`side` classes along the longer side of the array, the corner's first."""
+def _classes(count: tuple[int, int], side: int) -> list[Tile]:
+    """`side` classes along the longer side of the array, row by row."""
     size = -(-max(count) // side)
     ends = [np.rint(np.linspace(0, n, -(-n // size) + 1)).astype(int).tolist() for n in count]
     lines = [
-        [_line(low, high, n) for low, high in zip(edges, edges[1:])]
+        [
+            (slice(low, high), slice(max(0, low - MARGIN), min(n, high + MARGIN)))
+            for low, high in zip(edges, edges[1:])
+        ]
         for edges, n in zip(ends, count)
     ]
-    for rows in lines[0]:
-        for columns in lines[1]:
-            yield _Class(*zip(rows, columns))
-
-
-def _line(low: int, high: int, count: int) -> tuple[slice, slice, slice]:
-    """(own, around, within) along one axis."""
-    start = max(0, low - MARGIN)
-    around = slice(start, min(count, high + MARGIN))
-    return slice(low, high), around, slice(low - start, high - start)
-
-
-def _cut(data: Superpixels, each: _Class) -> Superpixels:
-    saturated, variance = (
-        None if values is None else values[each.around]
-        for values in (data.saturated, data.variance)
-    )
-    return replace(data, y=data.y[each.around], saturated=saturated, variance=variance)
+    return [
+        Tile((rows, columns), (near, beside))
+        for rows, near in lines[0]
+        for columns, beside in lines[1]
+    ]

@@ -13,10 +13,9 @@ import numpy as np
 
 from plenocli.base.budget import both, on_threads
 from plenocli.base.errors import PlenoError
-from plenocli.base.progress import bar, collected_notes, note
+from plenocli.base.progress import bar, collected_notes
 from plenocli.execution.pool import Pool, run_all
 from plenocli.files.artefacts.provenance import file_digest
-from plenocli.files.bench import Bench
 from plenocli.files.read.captures import describe_capture, superpixel_source
 from plenocli.inverse.picture.diagnosis import Seen
 from plenocli.inverse.picture.estimate import estimate
@@ -26,11 +25,9 @@ from plenocli.inverse.picture.lenslet_model import Superpixels, Whole
 from plenocli.inverse.picture.methods.registry import METHODS
 from plenocli.inverse.picture.reconstruction import Reconstruction
 from plenocli.inverse.picture.tiles import (
-    NUISANCES,
     Area,
     Source,
     Tile,
-    joined,
     largest_tile,
     side_of,
     spread_over,
@@ -46,7 +43,12 @@ from plenocli.stages.inverse.reconstruct.recipe import (
     finer_of,
 )
 from plenocli.stages.inverse.reconstruct.solved import Solved
-from plenocli.stages.inverse.reconstruct.tiles import SolvedTile, picture, solve_all
+from plenocli.stages.inverse.reconstruct.tiles import (
+    SolvedTile,
+    bench_of,
+    put_together,
+    solve_all,
+)
 from plenocli.stages.inverse.reconstruct.truth import truth_of
 
 if TYPE_CHECKING:
@@ -59,9 +61,9 @@ def picture_in_tiles(
     source: Source,
     tiles: Sequence[Tile],
     pool: Pool,
-    target: Path,
+    target: Path | None,
 ) -> Solved:
-    """The picture of a capture that is larger than a tile."""
+    """The picture of a capture that is larger than a tile; target: as of bench_of."""
     settings, system = recipe.settings, estimators_of(recipe).system
     # what comes before there are tiles is worked out by as many threads
     with on_threads(settings.workers):
@@ -69,25 +71,17 @@ def picture_in_tiles(
     sample, task = typical.found, typical.task
     all_weigh = METHODS[sample.method].weighs_all  # of the one that auto took
     task = task.sharing(pool, tiles if all_weigh else spread_over(source.count, side_of(system)))
-    depends = replace(settings, workers=1), recipe.digests, typical.capture, tiles
-    bench = Bench.beside(target, depends)
-    clip = partial(np.maximum, 0) if settings.clip else np.asarray
-    stats = solve_all(pool, task, tiles, bench, clip)
-    value, sigma, counted = picture(bench, tiles, system.object_shape, max(1, len(system.bands)))
-    size = source.count[0] * source.count[1] * system.own.shape[0]
-    parts: dict[str, Any] = {"value": value, "sigma": sigma, "stats": stats or sample.stats}
-    trace = joined(sample, counted[1:], size, declared=typical.declared)
-    for entry in trace:
-        if isinstance(entry, NUISANCES) and entry.found:
-            note(entry.sentence)
-    return Solved(
-        found=replace(sample, trace=trace, **parts),
+    bench = bench_of(target, (replace(settings, workers=1), recipe.digests, typical.capture, tiles))
+    stats = solve_all(pool, task, tiles, bench, clip=settings.clip)
+    return put_together(
+        replace(sample, stats=stats or sample.stats),
+        bench,
+        tiles,
+        system,
+        declared=typical.declared,
         capture=typical.capture,
         seen=typical.seen,
         limits=typical.limits,
-        negative_share=float(counted[0]) / np.prod(value.shape),
-        block=system.object_shape,
-        bands=system.bands,
     )
 
 
@@ -124,7 +118,12 @@ class _Typical:
 
     @classmethod
     def of(
-        cls, recipe: Recipe, capture: Path, source: Source, tiles: Sequence[Tile], target: Path
+        cls,
+        recipe: Recipe,
+        capture: Path,
+        source: Source,
+        tiles: Sequence[Tile],
+        target: Path | None,
     ) -> _Typical:
         """Of a capture whose tiles fit the memory. Raises NumericsError."""
         method, described = METHODS[recipe.settings.method], estimators_of(recipe)
@@ -154,7 +153,7 @@ class _Typical:
         estimators, off = estimators_by(recipe, matrix), error_that_counts(limits)
         declared = data.saturated is not None
         data, cause = replace(data, whole=whole), partial(likely_cause, estimators)
-        truth = _true_objects(recipe, source, middle.own)
+        truth = true_objects(recipe, source, middle.own)
         found, seen = estimate(estimators, method, data, truth, model_error=off, explain=cause)
         task = _TileTask(
             recipe=recipe,
@@ -181,7 +180,7 @@ class _TileTask:
 
     recipe: Recipe
     capture: Path
-    target: Path
+    target: Path | None
     matrix: Matrix
     model_error: float
     whole: Whole
@@ -228,11 +227,11 @@ class _TileTask:
                 verify=False,
             )
             data = replace(source.cut(*tile.around, tile.within), whole=whole)
-            truth = _true_objects(recipe, source, tile.around)
+            truth = true_objects(recipe, source, tile.around)
             return estimate(estimators, method, data, truth, model_error=self.model_error)[0]
 
 
-def _true_objects(recipe: Recipe, source: Source, area: Area) -> np.ndarray | None:
+def true_objects(recipe: Recipe, source: Source, area: Area) -> np.ndarray | None:
     """Those of some lenslets, where a person gave them."""
     known = truth_of(recipe, source.count)
     return None if known is None else known.cut(*area)

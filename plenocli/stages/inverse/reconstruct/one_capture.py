@@ -10,22 +10,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from plenocli.base.errors import UsageError
 from plenocli.base.progress import note
 from plenocli.base.tiling import Plane, bands
 from plenocli.execution.pool import InProcess, Pool
 from plenocli.files.read.calibrations import read_white
 from plenocli.files.read.captures import describe_capture, room_beside, superpixel_source
-from plenocli.files.read.system_matrices import FieldMatrix
 from plenocli.forward.sensor.cfa import cfa_map
 from plenocli.forward.sensor.superpixel import extract_rows
 from plenocli.inverse.calibration.calibration import Windows, there
-from plenocli.inverse.picture.diagnosis import Seen
 from plenocli.inverse.picture.estimate import estimate
-from plenocli.inverse.picture.estimators import Estimators
 from plenocli.inverse.picture.footprint import require_reconstruction
-from plenocli.inverse.picture.lenslet_model import Superpixels
-from plenocli.inverse.picture.methods.method import Method
 from plenocli.inverse.picture.methods.registry import METHODS
 from plenocli.inverse.picture.reconstruction import Choice, Reconstruction
 from plenocli.inverse.picture.superpixels import windows_of
@@ -33,7 +27,7 @@ from plenocli.inverse.picture.tiles import (
     EVERY,
     tiles_of,
 )
-from plenocli.stages.inverse.reconstruct.field_classes import estimate_by_class
+from plenocli.stages.inverse.reconstruct.field_classes import picture_by_class
 from plenocli.stages.inverse.reconstruct.fitted_matrix import likely_cause
 from plenocli.stages.inverse.reconstruct.in_tiles import (
     error_that_counts,
@@ -52,7 +46,6 @@ from plenocli.stages.inverse.reconstruct.solved import Solved
 from plenocli.stages.inverse.reconstruct.truth import truth_of
 
 if TYPE_CHECKING:
-    from plenocli.forward.accuracy.limiting_error import Limits
     from plenocli.forward.sensor.capture import Capture
 
 BAND = 1 << 20
@@ -84,16 +77,11 @@ def reconstruct_capture(
     source = superpixel_source(
         capture, system, recipe.calibration, each_pixel=method.each_pixel, beside=where
     )
-    tiles = tiles_of(estimators, method, source.count)
-    field = field_of(recipe)
-    if settings.fit and field is not None:
-        raise UsageError(
-            "a camera is fitted by the matrix of one lenslet, not by those of a whole array",
-            "--fit",
-            "leave it out, or fit the camera first with fit-camera",
-        )
-    if len(tiles) > 1 and field is None and where is not None:
-        return picture_in_tiles(recipe, capture, source, tiles, pool or InProcess(), where)
+    tasks, tiles = pool or InProcess(), tiles_of(estimators, method, source.count)
+    if field_of(recipe) is not None:
+        return picture_by_class(recipe, capture, source, tasks, where)
+    if len(tiles) > 1:
+        return picture_in_tiles(recipe, capture, source, tiles, tasks, where)
     data = source.cut(*EVERY)
     require_reconstruction(
         estimators,
@@ -107,7 +95,8 @@ def reconstruct_capture(
     truth = None if known is None else known.cut(*EVERY)
     matrix, limits = matrix_that_serves(recipe, matrix_of_capture(recipe, source, capture), data)
     estimators = estimators_by(recipe, matrix)
-    found, seen = _estimate(field, estimators, method, data, truth, limits)
+    off, cause = error_that_counts(limits), partial(likely_cause, estimators)
+    found, seen = estimate(estimators, method, data, truth, model_error=off, explain=cause)
     return _solved(
         found.as_picture(system.object_shape),
         settings,
@@ -116,31 +105,6 @@ def reconstruct_capture(
         limits=limits,
         block=system.object_shape,
         bands=system.bands,
-    )
-
-
-def _estimate(
-    field: FieldMatrix | None,
-    estimators: Estimators,
-    method: Method,
-    data: Superpixels,
-    truth: np.ndarray | None,
-    limits: Limits | None,
-) -> tuple[Reconstruction, Seen | None]:
-    """The picture by one matrix, or by those of a whole array."""
-    off = error_that_counts(limits)
-    if field is None:
-        cause = partial(likely_cause, estimators)
-        return estimate(estimators, method, data, truth, model_error=off, explain=cause)
-    noise = 0.0 if limits is None else limits.noise
-    return estimate_by_class(
-        field,
-        estimators,
-        method,
-        data,
-        truth,
-        tolerance=max(noise, field.nodes.error),
-        model_error=off,
     )
 
 

@@ -5,17 +5,21 @@ run that was killed goes on from them.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from plenocli.base.errors import OutputError, PlenoError
-from plenocli.base.progress import bar
+from plenocli.base.progress import bar, note
 from plenocli.base.tiling import InParts, bands, to_plane
 from plenocli.execution.pool import Pool, run_all
 from plenocli.files.bench import Bench
-from plenocli.inverse.picture.reconstruction import Entry, Stats
-from plenocli.inverse.picture.tiles import Tile, counts
+from plenocli.inverse.picture.lenslet_model import LensletMatrix
+from plenocli.inverse.picture.reconstruction import Entry, Reconstruction, Stats
+from plenocli.inverse.picture.tiles import NUISANCES, Tile, counts, joined
+from plenocli.stages.inverse.reconstruct.solved import Solved
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,7 +48,7 @@ class PlaneOfTiles:
     bands: of the picture.
     """
 
-    bench: Bench
+    bench: Bench | HeldTiles
     tiles: tuple[Tile, ...]
     which: int
     shape: tuple[int, int]
@@ -69,17 +73,43 @@ class PlaneOfTiles:
         return arrays[self.which]
 
 
+@dataclass(frozen=True)
+class HeldTiles:
+    """A Bench in memory, of a result of which nobody knows here where it will lie."""
+
+    folder: None = None
+    tiles: dict[int, tuple[np.ndarray, ...]] = field(default_factory=dict)
+
+    def get(self, tile: int) -> tuple[np.ndarray, ...] | None:
+        """As of Bench."""
+        return self.tiles.get(tile)
+
+    def put(self, tile: int, arrays: Sequence[np.ndarray]) -> None:
+        """As of Bench."""
+        self.tiles[tile] = tuple(arrays)
+
+
+def bench_of(target: Path | None, depends: Any) -> Bench | HeldTiles:
+    """Where the tiles of a result are kept until it is written.
+
+    target: the result; None where that is elsewhere.
+    depends: as of Bench.beside.
+    """
+    return HeldTiles() if target is None else Bench.beside(target, depends)
+
+
 def solve_all(
     pool: Pool,
     task: Callable[[tuple[int, Tile]], SolvedTile],
     tiles: Sequence[Tile],
-    bench: Bench,
-    finish: Callable[[np.ndarray], np.ndarray],
+    bench: Bench | HeldTiles,
+    *,
+    clip: bool,
 ) -> Stats | None:
     """Solve the tiles that are not finished; the first PlenoError is raised.
 
     task: found by its name in a module, for other processes.
-    finish: what becomes of a value before it is kept.
+    clip: as of `keep`.
 
     Returns what the method tells of one of them, None where none was left to be solved.
     """
@@ -90,35 +120,68 @@ def solve_all(
         for number, found in run_all(pool, ((job[0], task, job) for job in todo)):
             if isinstance(found, PlenoError):
                 raise found
-            values = [finish(found.value), *([] if found.sigma is None else [found.sigma])]
-            # what is negative is counted before it is clipped
-            counted = [np.count_nonzero(found.value < 0), *counts(found.trace)]
-            bench.put(number, [*values, np.array(counted, float)])
+            keep(bench, number, found, clip=clip)
             stats = found.stats
             progress.update()
     return stats
 
 
-def picture(
-    bench: Bench, tiles: Sequence[Tile], shape: tuple[int, int], bands: int
-) -> tuple[InParts, InParts | None, np.ndarray]:
-    """(value, sigma or None, how many values are negative and the sum of the tiles' `counts`) of a
-    picture whose tiles are finished.
+def keep(bench: Bench | HeldTiles, number: int, found: SolvedTile, *, clip: bool) -> None:
+    """Keep a finished tile; clip: its negative values set to zero."""
+    # what is negative is counted before
+    counted = [np.count_nonzero(found.value < 0), *counts(found.trace)]
+    values = [np.maximum(found.value, 0) if clip else found.value]
+    values += [] if found.sigma is None else [found.sigma]
+    bench.put(number, [*values, np.array(counted, float)])
+
+
+def put_together(
+    sample: Reconstruction,
+    bench: Bench | HeldTiles,
+    tiles: Sequence[Tile],
+    system: LensletMatrix,
+    *,
+    declared: bool,
+    **told: Any,
+) -> Solved:
+    """The picture of a capture whose tiles are finished.
+
+    sample: of the piece that stands for it, with the stats of the method.
+    system: the matrix of its lenslets.
+    declared: whether the capture says where its sensor saturates.
+    told: what else there is to tell of it, as in Solved.
     """
-    first = bench.get(0)
+    first, bands = bench.get(0), max(1, len(system.bands))
     assert first is not None
-    rows, columns = (n * max(tile.own[axis].stop for tile in tiles) for axis, n in enumerate(shape))
+    count = [max(tile.own[axis].stop for tile in tiles) for axis in (0, 1)]
+    rows, columns = (n * points for n, points in zip(count, system.object_shape))
     size = (rows, columns) if bands == 1 else (bands, rows, columns)
-    found = [
+    parts = [
         InParts(
             shape=size,
             dtype=np.float64,
             parts=PlaneOfTiles(
-                bench=bench, tiles=tuple(tiles), which=which, shape=shape, bands=bands
+                bench=bench,
+                tiles=tuple(tiles),
+                which=which,
+                shape=system.object_shape,
+                bands=bands,
             ),
         )
         for which in range(len(first) - 1)
     ]
     read = map(bench.get, range(len(tiles)))
-    counted = sum(arrays[-1] for arrays in read if arrays is not None)
-    return found[0], found[1] if len(found) > 1 else None, np.asarray(counted)
+    counted = np.asarray(sum(arrays[-1] for arrays in read if arrays is not None))
+    pixels = count[0] * count[1] * system.own.shape[0]
+    trace = joined(sample, counted[1:], pixels, declared=declared)
+    for entry in trace:
+        if isinstance(entry, NUISANCES) and entry.found:
+            note(entry.sentence)
+    made: dict[str, Any] = {"value": parts[0], "sigma": parts[1] if len(parts) > 1 else None}
+    return Solved(
+        found=replace(sample, trace=trace, **made),
+        negative_share=float(counted[0]) / np.prod(size),
+        block=system.object_shape,
+        bands=system.bands,
+        **told,
+    )

@@ -99,7 +99,7 @@ def test_stored_windows_of_any_file_are_parts_of_the_whole(tmp_path):
     levels = np.array([[3.0, 5.0], [7.0, 11.0]])
     write_dng(tmp_path / "x.dng", values, cfa="GBRG", black=levels, white=4095)
     with within(LITTLE), stored_capture(tmp_path / "x.dng", room=Scratch(tmp_path / "o")) as found:
-        assert (found.shape, found.itemsize) == (SHAPE, 2)
+        assert (found.shape, found.dtype.itemsize) == (SHAPE, 2)
         part = found.window(slice(5, 1000), slice(8, 12))
     np.testing.assert_array_equal(part.mosaic, values[5:1000, 8:12])
     np.testing.assert_array_equal(part.levels.black, levels[::-1])

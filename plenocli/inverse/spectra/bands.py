@@ -15,7 +15,6 @@ import numpy as np
 
 from plenocli.forward.camera.pupil import filter_cells, filter_transmittance
 from plenocli.inverse.calibration.calibration import there
-from plenocli.inverse.calibration.quality import mean_of_known
 from plenocli.inverse.registration.moved_response import mixed
 from plenocli.inverse.spectra.responses import LensletResponses
 
@@ -141,7 +140,7 @@ def by_filter(calibration: Calibration, camera: Camera | None) -> Calibration:
         for w in response.wavelengths
     ]
     lenslets = LensletResponses.of(calibration)
-    column = lenslets.common if lenslets.shared else mean_of_known(lenslets.sampled_response)
+    column = lenslets.typical
     light = lenslets.white_light
     if light is None or not min(lit) > 0:
         return calibration

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from plenocli.base.tiling import FORGETFUL, Keeper, kept
 from plenocli.forward.sensor.noise import Noise
 from plenocli.inverse.spectra.field_modes import EVEN
 from plenocli.inverse.spectra.lattice_system import LatticeSystem, PointPrior
@@ -102,25 +103,36 @@ class LatticeAnswer:
         return float(np.nanmedian(self.residual)) if np.isfinite(self.residual).any() else 0.0
 
 
-def coupled(capture: LatticeCapture, light: NeighbourLight, fit: bool = True) -> LatticeAnswer:
+def coupled(
+    capture: LatticeCapture,
+    light: NeighbourLight,
+    fit: bool = True,
+    keeper: Keeper = FORGETFUL,
+) -> LatticeAnswer:
     """One radiance a lenslet and band, and no prior.
 
     capture: with its first answer.
     light: predicted, of the neighbours.
     fit: whether its changes are fitted to the capture.
+    keeper: of each solution.
     """
     amounts, start, taken = np.zeros(len(light.changes)), capture.first(), light
-    for _ in range(TURNS if fit else 0):
+
+    def fitted() -> tuple[np.ndarray, np.ndarray]:
         system = _coupled_system(capture, taken)
-        start, left = _solved(system, capture, start)
-        step = _change_step(system, capture, light, start, left, amounts)
+        points = _solved(system, capture, start)
+        left = _left(system, capture, points)
+        return points, _change_step(system, capture, light, points, left, amounts)
+
+    for turn in range(TURNS if fit else 0):
+        points, step = kept(keeper, f"fit{turn}", fitted)
+        start = points.astype(np.float32)
         amounts = np.clip(amounts + step, -MOST, MOST)
         taken = light.changed(amounts)
         if np.abs(step).max() < 0.02:
             break
     system = _coupled_system(capture, taken)
-    points, left = _solved(system, capture, start)
-    return _answer(system, capture, points, left, taken)
+    return _answered(system, capture, start, taken, keeper.under("coupled"))
 
 
 def fine(
@@ -128,12 +140,14 @@ def fine(
     first: LatticeAnswer,
     light: NeighbourLight,
     stepped: tuple[float, float],
+    keeper: Keeper = FORGETFUL,
 ) -> LatticeAnswer:
     """What lies where in each field, band by band, with the prior that the first answer shows.
 
     first: by `coupled`.
     light: predicted, of the neighbours.
     stepped: as PointPrior has it.
+    keeper: of the solution.
     """
     prior = replace(_prior(first), stepped=stepped)
     system = LatticeSystem(
@@ -143,8 +157,8 @@ def fine(
         first.value.shape[:2],
         prior,
     )
-    points, left = _solved(system, capture, _even_points(first.value, light))
-    return _answer(system, capture, points, left, light)
+    start = _even_points(first.value, light)
+    return _answered(system, capture, start, light, keeper.under("fine"))
 
 
 def likeliest(
@@ -164,14 +178,21 @@ def likeliest(
     value, variance = first.value[part], _stationary(capture, first.value)
     shape, blocks, start = value.shape[:2], _by_mode(capture, light), _even_points(value, light)
     tried: dict[tuple[float, float], tuple[LatticeSystem, np.ndarray, np.ndarray]] = {}
+
+    def solved(
+        system: LatticeSystem, start: np.ndarray
+    ) -> tuple[LatticeSystem, np.ndarray, np.ndarray]:
+        points = _solved(system, cut, start)
+        return system, points, _left(system, cut, points)
+
     for stepped in ((0.0, 0.0), (STEPPED, 0.0), (0.0, STEPPED)):
         alike = replace(prior, stepped=stepped)
         system = LatticeSystem(blocks, light.offsets, variance, shape, alike)
-        tried[stepped] = (system, *_solved(system, cut, start))
+        tried[stepped] = solved(system, start)
     each = first.light.coupled(capture.response)
     alike = replace(prior, modes=EVEN)
     system = LatticeSystem(each, first.light.offsets, variance, shape, alike)
-    tried[STEPPED, STEPPED] = (system, *_solved(system, cut, value))
+    tried[STEPPED, STEPPED] = solved(system, value)
     system, points, left = tried[0.0, 0.0]
     misfit = np.nanmedian(_residual(cut, system.mean(points), left))
     scale = np.sqrt(variance * max(1.0, float(np.nan_to_num(misfit))))
@@ -229,16 +250,31 @@ def _stationary(capture: LatticeCapture, radiance: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(capture.response).all(axis=-1), variance, np.inf)
 
 
-def _solved(
-    system: LatticeSystem, capture: LatticeCapture, points: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """(unknowns, what they leave of the superpixels, 0 where nothing is known), from a guess."""
+def _solved(system: LatticeSystem, capture: LatticeCapture, points: np.ndarray) -> np.ndarray:
+    """Unknowns, from a guess."""
     values = np.where(np.isfinite(capture.response).all(axis=-1), capture.values, 0)
-    points = system.solved(values, points, capture.own)
+    return system.solved(values, points, capture.own)
+
+
+def _left(system: LatticeSystem, capture: LatticeCapture, points: np.ndarray) -> np.ndarray:
+    """What unknowns leave of the superpixels, 0 where nothing is known."""
     left = capture.values - system.forward(points)
     if capture.own is not None:
         left -= capture.own(system.mean(points))
-    return points, np.where(np.isfinite(left) & capture.known, left, 0)
+    return np.where(np.isfinite(left) & capture.known, left, 0)
+
+
+def _answered(
+    system: LatticeSystem,
+    capture: LatticeCapture,
+    start: np.ndarray,
+    light: NeighbourLight,
+    keeper: Keeper,
+) -> LatticeAnswer:
+    """The answer from a guess, or from its solution if an earlier run left that."""
+    points = kept(keeper, "points", lambda: (_solved(system, capture, start),))[0]
+    points = points.astype(np.float32, copy=False)
+    return _answer(system, capture, points, _left(system, capture, points), light)
 
 
 def _answer(

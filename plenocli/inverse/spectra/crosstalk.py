@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from plenocli.base.errors import NumericsError
+from plenocli.base.tiling import FORGETFUL, Keeper
 from plenocli.inverse.registration.motion import SIGNIFICANT
 from plenocli.inverse.spectra.coupled import (
     LatticeAnswer,
@@ -47,6 +48,7 @@ class Crosstalk:
     values: (lenslet_row, lenslet_column, pixel), NaN where unknown.
     noise: of the values.
     ratio: whether errors of F divide out, as plenocli.inverse.spectra.radiance.estimate has it.
+    keeper: of solutions.
 
     first: the answer with one radiance a lenslet.
     """
@@ -59,10 +61,11 @@ class Crosstalk:
         noise: Noise,
         *,
         ratio: bool = False,
+        keeper: Keeper = FORGETFUL,
     ) -> None:
         """Solve for one radiance a lenslet."""
         self.c, self.light, self.values = c, light, values
-        self.noise, self.ratio = noise, ratio
+        self.noise, self.ratio, self.keeper = noise, ratio, keeper
         response, own = _common(c)
         self.capture = LatticeCapture(
             values=values,
@@ -73,7 +76,7 @@ class Crosstalk:
             start=np.moveaxis(self._alone(values, "pinv").value, 0, -1),
             ratio=ratio,
         )
-        self.first: LatticeAnswer = coupled(self.capture, light)
+        self.first: LatticeAnswer = coupled(self.capture, light, keeper=keeper)
 
     def _alone(self, values: np.ndarray, method: str) -> Spectra:
         return estimate(self.c, values, self.noise, method, ratio=self.ratio)
@@ -114,7 +117,7 @@ class Crosstalk:
             stepped = likeliest(self.capture, self.first, self.light)
             # what was fitted may be an edge inside a field
             light = self.first.light if all(stepped) else self.light
-            found = {"fine": fine(self.capture, self.first, light, stepped)}
+            found = {"fine": fine(self.capture, self.first, light, stepped, self.keeper)}
             answers = answers | found if all(stepped) else found
         if method in METHODS:
             return self._told(answers[method], method, method, "asked for")
@@ -180,14 +183,10 @@ def _spectra(
 def _common(
     c: LensletResponses,
 ) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray] | None]:
-    """(F (pixel, band) of all lenslets, or the mean of a sample of their own; what their own add
-    to superpixels, or None).
-    """
-    from plenocli.inverse.calibration.quality import mean_of_known
-
+    """(The typical F (pixel, band), and what lenslets' own add to superpixels, or None)."""
+    mean = np.asarray(c.typical, float)
     if c.shared:
-        return np.asarray(c.common, float), None
-    mean = np.asarray(mean_of_known(c.sampled_response), float)
+        return mean, None
     step = max(1, BATCH_NUMBERS // mean.size)
 
     def own(radiance: np.ndarray) -> np.ndarray:

@@ -57,6 +57,8 @@ a capture as calibrated and of one that moved (measured).
 """
 TURNS = 2
 """Looks for motion, each with the neighbours' light as the last left it."""
+SHIFTS = 3
+"""Solutions of a capture whose lenslets are displaced alike, each where the last one says."""
 
 
 class Demultiplexer:
@@ -147,7 +149,7 @@ class Demultiplexer:
 
         path: of the capture, for messages.
         method: instead of the usual one.
-        keeper: of tiles of this capture, where lenslets are on their own.
+        keeper: of tiles of this capture, or of solutions for all lenslets.
 
         Returns Spectra whose bands may come in two states (plenocli.inverse.spectra.bands).
         Raises InputError where capture and calibration do not go together, NumericsError where no
@@ -159,7 +161,7 @@ class Demultiplexer:
         if self.neighbours is None or noise is None or method not in (*NEIGHBOURLY, "auto"):
             found = self._alone(partial(self._aligned, signal, noise, method, path, keeper))
         else:
-            found = self._together(self.neighbours, signal, noise, method, path)
+            found = self._together(self.neighbours, signal, noise, method, path, keeper)
         if not np.isfinite(found.value).any():
             raise NumericsError(
                 "no lenslet could be demultiplexed", path, "check exposure and calibration"
@@ -176,17 +178,23 @@ class Demultiplexer:
         return found
 
     def _together(
-        self, light: NeighbourLight, signal: Readout, noise: Noise, method: str, path: Name
+        self,
+        light: NeighbourLight,
+        signal: Readout,
+        noise: Noise,
+        method: str,
+        path: Name,
+        keeper: Keeper,
     ) -> Spectra:
         """All lenslets at once; motion is looked for in what neighbours did not do, and taken where
         it explains more.
         """
         c = self.responses
         self._require_together(signal, path, PLANES)
-        best = self._crosstalk(c, light, windows_of(c, signal), noise)
+        best = self._crosstalk(c, light, windows_of(c, signal), noise, keeper.under("still"))
         found: Registration | None = None
         last = best
-        for _ in range(TURNS if self.register != "off" else 0):
+        for turn in range(TURNS if self.register != "off" else 0):
             plane = sensor_of(last.c, last.freed())
             aligned = align(c, plane, noise, self.register, path)
             if aligned.registration and "motion" in aligned.registration.corrected:
@@ -197,7 +205,8 @@ class Demultiplexer:
                 found = found or tried
                 break
             self._require_together(signal, path, PLANES_OF_MOVED)
-            last = self._moved(light, aligned, tried.motion, signal, noise)
+            moved = keeper.under(f"moved{turn}")
+            last = self._moved(light, aligned, tried.motion, signal, noise, moved)
             if self.register == "auto" and not last.explains_more_than(best):
                 found = found or replace(tried, corrected=())
                 break
@@ -218,6 +227,7 @@ class Demultiplexer:
         motion: Motion,
         signal: Readout,
         noise: Noise,
+        keeper: Keeper,
     ) -> Crosstalk:
         """The capture where its lenslets are, without what else stands between it and the
         calibration: displaced alike by prediction, or each by splines where that explains more.
@@ -225,30 +235,31 @@ class Demultiplexer:
         corrected = aligned.registration.corrected if aligned.registration else ()
         plain = signal - motion.offset if "offset" in corrected else signal
 
-        def solved(c: LensletResponses, light: NeighbourLight) -> Crosstalk:
+        def solved(c: LensletResponses, light: NeighbourLight, name: str) -> Crosstalk:
             values = windows_of(c, plain)
             if "stray light" in corrected:
                 values -= motion.stray * np.nanmean(values, axis=-1, keepdims=True)
-            return self._crosstalk(c, light, values, noise)
+            return self._crosstalk(c, light, values, noise, keeper.under(name))
 
         before, after = self.responses, aligned.responses
         if "motion" not in corrected:
-            return solved(after, light)
+            return solved(after, light, "alike")
         each = None
         if self.moving is None or not after.shared:
-            each = solved(after, self._at(light, displacement(before, after, motion)))
+            near = self._at(light, displacement(before, after, motion))
+            each = solved(after, near, "each")
             if self.moving is None:
                 return each
         shift = motion.at(before.centres[before.sites]).mean(axis=0)
         known = 0 if before.variance is None else before.variance
-        for last in (False, False, True):
+        for turn in range(SHIFTS):
             whole = np.rint(shift)
             c, rest = replace(before, origin=before.origin + whole.astype(int)), shift - whole
             response, variance = self.moving.at(rest), known + self.moving.variance(rest)
             c = replace(c, response=response.astype(np.float32), variance=variance)
-            found = solved(c, self._at(light, rest))
+            found = solved(c, self._at(light, rest), f"shift{turn}")
             step = np.clip(found.shift_step(self.moving, rest), -0.1, 0.1)
-            if last or np.abs(step).max() < LEAST_STEP:
+            if np.abs(step).max() < LEAST_STEP:
                 break
             shift = shift + step
         return each if each is not None and each.explains_more_than(found) else found
@@ -262,9 +273,14 @@ class Demultiplexer:
         return self._displaced[place]
 
     def _crosstalk(
-        self, c: LensletResponses, light: NeighbourLight, values: np.ndarray, noise: Noise
+        self,
+        c: LensletResponses,
+        light: NeighbourLight,
+        values: np.ndarray,
+        noise: Noise,
+        keeper: Keeper,
     ) -> Crosstalk:
-        return Crosstalk(c, light, values, noise, ratio=self.ratio)
+        return Crosstalk(c, light, values, noise, ratio=self.ratio, keeper=keeper)
 
     def _believed(
         self,

@@ -19,6 +19,7 @@ from plenocli.forward.propagation.response import uniform_response, valid_for
 from plenocli.inverse.calibration.calibration import there
 from plenocli.inverse.registration.smooth_response import DEGREE
 from plenocli.inverse.spectra.field_modes import FieldModes, field_modes
+from plenocli.inverse.spectra.responses import LensletResponses
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -365,13 +366,8 @@ class MovingResponse:
 
 
 def _typical(calibration: Calibration) -> np.ndarray:
-    """F (pixel, band) of all lenslets, or the mean of their own ones."""
-    from plenocli.inverse.calibration.quality import mean_of_known
-
-    matrix = there(calibration.response).matrix
-    return np.asarray(
-        matrix if matrix.ndim == 2 else mean_of_known(matrix[calibration.grid.valid]), float
-    )
+    """F (pixel, band) as LensletResponses has it."""
+    return np.asarray(LensletResponses.of(calibration).typical, float)
 
 
 def _in_narrow_bands(calibration: Calibration) -> np.ndarray:

@@ -210,6 +210,13 @@ class LensletResponses:
         return self.at(tuple(site[self.sample] for site in self.sites))
 
     @cached_property
+    def typical(self) -> np.ndarray:
+        """F (pixel, band) of all lenslets, or the mean of the sample's own."""
+        from plenocli.inverse.calibration.quality import mean_of_known
+
+        return self.common if self.shared else mean_of_known(self.sampled_response)
+
+    @cached_property
     def sampled_pixels(self) -> tuple[np.ndarray, np.ndarray]:
         """`pixels` of the sample."""
         return _pixels(self.sampled_response[None] if self.shared else self.sampled_response)

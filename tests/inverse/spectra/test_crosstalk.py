@@ -111,9 +111,11 @@ def predicted_once():
     """
     predict, found = neighbours.neighbour_light, {}
 
+    @functools.wraps(predict)
     def known(camera, calibration):
         response = calibration.response
-        asked = (camera, *(v.tobytes() for v in (response.matrix, response.wavelengths)))
+        matrix = getattr(response.matrix, "values", response.matrix)
+        asked = (camera, *(v.tobytes() for v in (matrix, response.wavelengths)))
         if asked not in found:
             found[asked] = predict(camera, calibration)
         return found[asked]
@@ -192,6 +194,85 @@ def test_fine_is_left_out_where_the_response_is_predicted(bench):
     for one, taken in ((response, "coupled"), (calibration.response, "fine")):
         solver = Demultiplexer(replace(calibration, response=one), camera=camera, ratio=True)
         assert solver.estimate(shot, "x").method == taken
+
+
+class Notebook:
+    """A Keeper; it stops whoever asks it to keep more than `most` solutions."""
+
+    def __init__(self, known, most=10**6, prefix=""):
+        self.known, self.most, self.prefix = known, most, prefix
+
+    def get(self, tile):
+        return self.known.get(self.prefix + tile)
+
+    def put(self, tile, arrays):
+        if len(self.known) == self.most:
+            raise KeyboardInterrupt
+        self.known[self.prefix + tile] = [np.array(one, float) for one in arrays]
+
+    def under(self, name):
+        return Notebook(self.known, self.most, f"{self.prefix}{name}.")
+
+
+@pytest.mark.parametrize("own", [False, True])
+def test_solutions_that_an_earlier_run_left_give_the_same_bytes(bench, checkerboard, own):
+    """Of a capture that moved, whichever solution was the last."""
+    camera, calibration, _, shoot = bench
+    shot = shoot(Mosaic(camera.light.wavelengths, 5), seed=7, shift=(0.3, -0.2))
+    if own:
+        calibration = with_own(calibration)
+    solver = Demultiplexer(calibration, camera=camera, ratio=True)
+    kept = {}
+    whole = solver.estimate(shot, "x", "fine", Notebook(kept))
+    names = list(kept)
+    assert len(names) > 8 and len({name.split(".")[0] for name in names}) > 1
+    for most in (1, len(names) - 2):
+        known = {}
+        with pytest.raises(KeyboardInterrupt):
+            solver.estimate(shot, "x", "fine", Notebook(known, most))
+        assert list(known) == names[:most]
+        found = solver.estimate(shot, "x", "fine", Notebook(known))
+        assert list(known) == names
+        for part in ("value", "sigma", "residual"):
+            assert getattr(found, part).tobytes() == getattr(whole, part).tobytes()
+        assert repr(found.trace) == repr(whole.trace)
+
+
+def with_own(calibration):
+    """A calibration in which every lenslet has a response of its own, 1 % brighter or darker."""
+    valid = calibration.grid.valid
+    gains = 1 + 0.01 * np.random.default_rng(3).normal(size=(*valid.shape, 1, 1))
+    matrix = (gains * calibration.response.matrix).astype(np.float32)
+    white = (gains[..., 0] * calibration.white.superpixels).astype(np.float32)
+    return replace(
+        calibration,
+        response=replace(calibration.response, matrix=matrix),
+        white=replace(calibration.white, superpixels=white),
+    )
+
+
+class ByLenslet:
+    """Responses that stay in their file; plenocli.inverse.calibration.MadeResponses."""
+
+    def __init__(self, values):
+        self.values, self.shape, self.ndim = values, values.shape, values.ndim
+
+    def __getitem__(self, places):
+        assert isinstance(places, slice) or len(places) == 2
+        return self.values[places]
+
+
+def test_responses_that_stay_in_their_file_give_the_same(bench, checkerboard):
+    camera, calibration, _, _ = bench
+    held = with_own(calibration)
+    made = replace(held, response=replace(held.response, matrix=ByLenslet(held.response.matrix)))
+    light = [neighbours.neighbour_light.__wrapped__(camera, one).light for one in (held, made)]
+    np.testing.assert_array_equal(*light)
+    whole, found = (
+        Demultiplexer(one, camera=camera, several=False).estimate(checkerboard[1], "x", "coupled")
+        for one in (held, made)
+    )
+    np.testing.assert_array_equal(found.value, whole.value)
 
 
 def test_neighbours_light_comes_from_their_near_edges(bench):

@@ -108,6 +108,21 @@ class InParts:
             raise ValueError(f"{at} rows are not those of {self.shape}")
 
 
+def by_plane(values: np.ndarray | InParts) -> Iterator[np.ndarray]:
+    """Its planes, (row, column) each, one after the other."""
+    height, width = values.shape[-2:]
+    if not isinstance(values, InParts):
+        yield from values.reshape(-1, height, width)
+        return
+    plane, top = np.empty((height, width), values.dtype), 0
+    for part in values.parts():
+        plane[top : top + len(part)] = part
+        top += len(part)
+        if top == height:
+            yield plane
+            plane, top = np.empty((height, width), values.dtype), 0
+
+
 EVERYTHING = slice(None)
 
 Room = Callable[..., Any]

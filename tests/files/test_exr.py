@@ -283,7 +283,7 @@ def _other_values(real):
             (),
             {
                 "__getattr__": lambda self, name: getattr(source, name),
-                "read_image": lambda self, kind: source.read_image(kind) + 1,
+                "read_scanlines": lambda self, *which: source.read_scanlines(*which) + 1,
             },
         )
         return fake()

@@ -12,7 +12,6 @@ import pytest
 import tifffile
 from PIL import Image
 
-from plenocli.base.budget import Budget, within
 from plenocli.base.errors import ConfigError, InputError, NumericsError, OutputError, UsageError
 from plenocli.base.progress import collected_notes
 from plenocli.cli.sections import read_options
@@ -34,7 +33,6 @@ from plenocli.stages.forward.capture_settings import Settings as Capture
 from plenocli.stages.forward.capture_sim import run_capture_sim
 from plenocli.stages.forward.simulate_pif import Settings, run_simulate_pif
 from plenocli.stages.forward.simulate_stack import StackSummary
-from plenocli.stages.inverse import volume as stage
 from plenocli.stages.inverse.kept_windows import kept_part
 from plenocli.stages.inverse.refocus import Settings as Refocus
 from plenocli.stages.inverse.refocus import run_refocus
@@ -454,23 +452,6 @@ def same(found, wanted):
             same(getattr(found, name), value)
     else:
         assert repr(found) == repr(wanted)
-
-
-def test_an_ome_tiff_without_room_is_refused_before_the_work(seen, tmp_path, monkeypatch):
-    """3 planes of 14 x 12 voxels with errors, 3 times 4 bytes each, at the very limit."""
-    monkeypatch.setattr(Tiles, "_side", lambda self, count: tuple(count[:2]))
-    needed = 3 * 4 * 2 * 3 * 14 * 12
-    monkeypatch.setattr(Tiles, "volume", lambda self: pytest.fail("it worked"))
-    monkeypatch.setattr(stage, "COPIES", stage.COPIES * (1 << 20))
-    files = seen / "capture.h5", tmp_path / "v.ome.tif", seen / "stack.h5"
-    with (
-        within(Budget((needed << 20) - 1)),
-        pytest.raises(NumericsError, match=r"an OME-TIFF of this volume needs about 11\.9GiB"),
-    ):
-        run_volume(*files, method="lmmse", background=0.0)
-    assert [path.name for path in tmp_path.iterdir()] == []
-    with within(Budget(needed << 20)), pytest.raises(pytest.fail.Exception, match="it worked"):
-        run_volume(*files, method="lmmse", background=0.0)
 
 
 def test_a_capture_of_another_camera_is_refused(seen, tmp_path):

@@ -22,9 +22,10 @@ from plenocli.base.budget import budget
 from plenocli.base.errors import InputError, OutputError
 from plenocli.base.memory import size_text
 from plenocli.base.text import printable, utf8
-from plenocli.base.tiling import Plane
+from plenocli.base.tiling import EVERYTHING, Plane, bands
 from plenocli.files.artefacts.provenance import first_bytes
 from plenocli.files.atomic import check_output, replacement
+from plenocli.files.images.in_bands import rows_of
 from plenocli.files.outside import outside
 from plenocli.files.seal import SEAL, put_seal, require_seal
 
@@ -33,17 +34,19 @@ SEALED = "plenocli:seal"
 _CLOCK = re.compile(r"\d{4}(:\d\d){2} \d\d(:\d\d){2}")
 _EXR_MAGIC = b"\x76\x2f\x31\x01"
 _COMPRESSIONS = ("none", "zip", "zips", "rle", "piz", "zstd")  # those that lose nothing
+_BLOCK = 32
+"""Lines that any of them packs together, at most."""
 
 
 def write_exr(
     path: Name,
-    channels: Mapping[str, np.ndarray],
+    channels: Mapping[str, np.ndarray | Plane],
     attrs: Mapping[str, str] | None = None,
     *,
     overwrite: bool = False,
     compression: str = "zip",
 ) -> None:
-    """Write an EXR. Same input, same bytes.
+    """Write an EXR, some lines at a time. Same input, same bytes.
 
     Everything is read back and compared before the file takes its place.
     channels: name -> (row, column), all of one shape, stored as float32.
@@ -52,13 +55,10 @@ def write_exr(
 
     Raises ValueError (a bug of the caller: shapes, names), UsageError, OutputError.
     """
-    planes, attrs = _checked(channels, attrs or {}, compression)
+    image, attrs = _checked(channels, attrs or {}, compression)
     check_output(path, overwrite=overwrite)
-    names = sorted(planes)
-    rows, columns = planes[names[0]].shape
-    spec = _spec(names, rows, columns, attrs, compression)
+    spec = _spec(image, attrs, compression)
     spec.attribute(SEALED, SEAL)
-    pixels = np.ascontiguousarray(np.stack([planes[name] for name in names], axis=-1))
     with replacement(path, overwrite=overwrite) as (partial, descriptor):
         import OpenImageIO as oiio
 
@@ -71,7 +71,10 @@ def write_exr(
                 path,
                 "check the folder and the space left",
             )
-        written = output.write_image(pixels)
+        written = all(
+            output.write_scanlines(rows.start, rows.stop, 0, image.lines(rows))
+            for rows in image.in_bands
+        )
         closed = output.close()
         if not (written and closed):
             raise OutputError(
@@ -79,7 +82,7 @@ def write_exr(
                 path,
                 "free some space; nothing was changed",
             )
-        _verify(path, partial, pixels, names, attrs, compression)
+        _verify(path, partial, image, attrs, compression)
         put_seal(descriptor)
 
 
@@ -199,12 +202,41 @@ def _names(path: str) -> list[str]:
 # --- writing --------------------------------------------------------------------------------------
 
 
+@dataclass(frozen=True)
+class _Image:
+    """What is written.
+
+    planes: of the channels (row, column), by their names in order.
+    """
+
+    planes: dict[str, Plane]
+
+    @property
+    def names(self) -> list[str]:
+        return list(self.planes)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return next(iter(self.planes.values())).shape
+
+    @property
+    def in_bands(self) -> list[slice]:
+        """Rows of bands of whole blocks of lines, whatever the compression."""
+        most = rows_of(4 * self.shape[1] * len(self.planes))
+        return bands(self.shape[0], max(_BLOCK, most // _BLOCK * _BLOCK))
+
+    def lines(self, rows: slice) -> np.ndarray:
+        """Of all channels, (row, column, channel) float32."""
+        out = np.empty((rows.stop - rows.start, self.shape[1], len(self.planes)), np.float32)
+        for number, plane in enumerate(self.planes.values()):
+            out[..., number] = plane.read(rows, EVERYTHING)
+        return out
+
+
 def _checked(
-    channels: Mapping[str, np.ndarray], attrs: Mapping[str, str], compression: str
-) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-    planes = {
-        name: np.ascontiguousarray(values, dtype=np.float32) for name, values in channels.items()
-    }
+    channels: Mapping[str, np.ndarray | Plane], attrs: Mapping[str, str], compression: str
+) -> tuple[_Image, dict[str, str]]:
+    planes = {name: Plane.of(channels[name]) for name in sorted(channels)}
     shapes = {plane.shape for plane in planes.values()}
     if not planes or len(shapes) != 1 or any(len(s) != 2 or 0 in s for s in shapes):
         raise ValueError(
@@ -221,16 +253,15 @@ def _checked(
         )
     if compression not in _COMPRESSIONS:
         raise ValueError(f"EXR compression {compression!r} is none of {_COMPRESSIONS}")
-    return planes, {name: utf8(value).decode() for name, value in attrs.items()}
+    return _Image(planes), {name: utf8(value).decode() for name, value in attrs.items()}
 
 
-def _spec(
-    names: list[str], rows: int, columns: int, attrs: Mapping[str, str], compression: str
-) -> Any:
+def _spec(image: _Image, attrs: Mapping[str, str], compression: str) -> Any:
     import OpenImageIO as oiio
 
-    spec = oiio.ImageSpec(columns, rows, len(names), "float")
-    spec.channelnames = names
+    rows, columns = image.shape
+    spec = oiio.ImageSpec(columns, rows, len(image.names), "float")
+    spec.channelnames = image.names
     for name, value in attrs.items():
         spec.attribute(name, value)
     spec.attribute("compression", compression)
@@ -243,8 +274,7 @@ def _spec(
 def _verify(
     path: Name,
     partial: Path,
-    pixels: np.ndarray,
-    names: list[str],
+    image: _Image,
     attrs: dict[str, str],
     compression: str,
 ) -> None:
@@ -268,26 +298,30 @@ def _verify(
         for name, value in (attrs | {"compression": compression}).items()
         if back.get(name) != value
     ]
-    if sorted(stored) != sorted(names) or wrong or spec.format.basetype != oiio.FLOAT:
+    if sorted(stored) != image.names or wrong or spec.format.basetype != oiio.FLOAT:
         raise OutputError(
             f"EXR does not keep {wrong or 'the channel names'}", path, "use other names"
         )
-    found = source.read_image("float")
+    order, same = [stored.index(name) for name in image.names], True
+    for rows in image.in_bands:
+        found = source.read_scanlines(rows.start, rows.stop, 0, 0, len(order), "float")
+        lines = image.lines(rows)
+        same = (
+            same and found is not None and _is_same(found.reshape(lines.shape)[..., order], lines)
+        )
     trouble = oiio_error(source)
     source.close()
-    order = [stored.index(name) for name in names]
-    if (
-        found is None
-        or trouble
-        or not np.array_equal(
-            found.reshape(pixels.shape)[..., order].view(np.uint32), pixels.view(np.uint32)
-        )
-    ):
+    if trouble or not same:
         raise OutputError(
             f"does not hold what was written ({trouble or 'other values'})",
             path,
             "free some space; nothing was changed",
         )
+
+
+def _is_same(one: np.ndarray, other: np.ndarray) -> bool:
+    """Bit by bit, NaN too."""
+    return np.array_equal(one.view(np.uint32), other.view(np.uint32))
 
 
 # --- reading --------------------------------------------------------------------------------------

@@ -5,9 +5,8 @@ from __future__ import annotations
 import hashlib
 import os
 import uuid
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,9 +15,10 @@ import numpy as np
 from plenocli import __version__
 from plenocli.base.budget import budget
 from plenocli.base.errors import InputError, PlenoError
-from plenocli.base.tiling import InParts
+from plenocli.base.tiling import InParts, by_plane
+from plenocli.files.atomic import replacement
 from plenocli.files.outside import outside
-from plenocli.files.seal import SEAL, publish_sealed, require_seal
+from plenocli.files.seal import SEAL, put_seal, require_seal
 
 if TYPE_CHECKING:
     from tifffile import TiffFile
@@ -45,7 +45,8 @@ class Series:
     """One image of an OME-TIFF, a stack of pictures of one size.
 
     name: of the image.
-    values: (plane, channel, row, column).
+    shape: (planes, channels, rows, columns).
+    pictures: gives each (row, column), channel by channel of one plane after the other.
     channels: their names.
     spacing: m between rows and columns; None where nobody says.
     positions: (plane,) m along the axis, in order; None where nobody says.
@@ -53,7 +54,8 @@ class Series:
     """
 
     name: str
-    values: np.ndarray
+    shape: tuple[int, ...]
+    pictures: Callable[[], Iterable[np.ndarray]]
     channels: list[str]
     spacing: tuple[float, float] | None = None
     positions: np.ndarray | None = None
@@ -89,22 +91,30 @@ def write_ome_tiff(
     import tifffile
 
     digest = hashlib.sha256()
-    planes = [np.ascontiguousarray(one.values, dtype=np.float32) for one in series]
-    for values in planes:
-        digest.update(values.reshape(-1).data)
+    for one in series:
+        for picture in _single(one):
+            digest.update(picture.data)
     # else it has the clock and the machine in it
     name = uuid.uuid5(uuid.NAMESPACE_OID, digest.hexdigest()).urn
-    memory = BytesIO()
-    with tifffile.TiffWriter(memory, ome=True) as file:
-        for one, values in zip(series, planes, strict=True):
-            file.write(
-                values,
-                photometric="minisblack",
-                metadata=one.metadata() | {"UUID": name, "Creator": f"plenocli {__version__}"},
-                # named apart from the seal too: damage to one name leaves the other
-                software=f"written by plenocli {__version__}, {SEAL}",
-            )
-    publish_sealed(path, [memory.getbuffer()], overwrite=overwrite)
+    with replacement(path, overwrite=overwrite) as (partial, descriptor):
+        with open(partial, "r+b") as opened, tifffile.TiffWriter(opened, ome=True) as file:
+            for one in series:
+                file.write(
+                    _single(one),
+                    shape=one.shape,
+                    dtype=np.float32,
+                    photometric="minisblack",
+                    metadata=one.metadata() | {"UUID": name, "Creator": f"plenocli {__version__}"},
+                    # named apart from the seal too: damage to one name leaves the other
+                    software=f"written by plenocli {__version__}, {SEAL}",
+                )
+        put_seal(descriptor)
+
+
+def _single(series: Series) -> Iterator[np.ndarray]:
+    """Its pictures as they are stored."""
+    for picture in series.pictures():
+        yield np.ascontiguousarray(picture, dtype=np.float32)
 
 
 def write_volume_tiff(
@@ -124,19 +134,16 @@ def write_volume_tiff(
     Raises UsageError where the file exists, OutputError where it cannot be written.
     """
     both = [value] if sigma is None else [value, sigma]
-    names = ["volume", "sigma"][: len(both)]
-    planes, rows, columns = value.shape
-    values = np.empty((planes, len(both), rows, columns), np.float32)
-    for channel, part in enumerate(both):
-        own = values[:, channel]
-        if isinstance(part, InParts):
-            part.put_into(own)
-        else:
-            own[:] = part
+
+    def pictures() -> Iterator[np.ndarray]:
+        for plane in zip(*(by_plane(part) for part in both)):
+            yield from plane
+
     one = Series(
         name="volume",
-        values=values,
-        channels=names,
+        shape=(len(depth), len(both), *value.shape[-2:]),
+        pictures=pictures,
+        channels=["volume", "sigma"][: len(both)],
         spacing=spacing,
         positions=np.asarray(depth, float),
     )

@@ -1,11 +1,13 @@
 """Planes of refocus, into their artefact and out of it."""
 
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from plenocli.base.tiling import EVERYTHING, Plane, by_plane
 from plenocli.inverse.lightfield.planes import Colours, DepthMap, LightField
 from plenocli.inverse.lightfield.refocus import STEP
 from plenocli.inverse.lightfield.samples import Channels, SampleBands
@@ -65,7 +67,7 @@ def write_lightfield(
 ) -> None:
     """Write a light field as its artefact (.h5), as an OME-TIFF, or as an EXR, by the suffix.
 
-    field: its pictures may be InParts where it becomes an artefact.
+    field: its pictures may be in a file (plenocli.files.scratch.ScratchRows).
     source: what it was made from.
 
     Raises UsageError, OutputError.
@@ -107,28 +109,34 @@ def _series(field: LightField) -> Iterator["Series"]:
     colours, spacing = field.colours, field.spacing
     names = ["grey"] if colours is None else list(colours.channels.names)
 
-    def every(pitch: float) -> tuple[float, float] | None:
-        return None if spacing is None or not np.isfinite(spacing) else (spacing / pitch,) * 2
+    def one(name: str, values: Any, pitch: float, channels: list[str], **more: Any) -> "Series":
+        """Of values (..., row, column), those of one picture after the other."""
+        shape = values.shape[-2:]
+        pictures = math.prod(values.shape[:-2])
+        known = spacing is not None and np.isfinite(spacing)
+        return Series(
+            name=name,
+            shape=(pictures // len(channels), len(channels), *shape),
+            pictures=lambda: by_plane(values),
+            channels=channels,
+            spacing=(spacing / pitch,) * 2 if spacing is not None and known else None,
+            **more,
+        )
 
-    def one(name: str, values: np.ndarray, pitch: float, **more: Any) -> "Series":
-        return Series(name=name, values=values, channels=names, spacing=every(pitch), **more)
-
-    planes = field.pictures[:, None] if colours is None else colours.pictures
-    yield one("planes", planes, STEP, positions=field.distances)
+    planes = field.pictures if colours is None else colours.pictures
+    yield one("planes", planes, STEP, names, positions=field.distances)
     if field.sharp is not None:
-        sharp = field.sharp[None] if colours is None or colours.sharp is None else colours.sharp
-        yield one("everything in focus", sharp[None], STEP)
+        sharp = field.sharp if colours is None else colours.sharp
+        yield one("everything in focus", sharp, STEP, names)
     maps = _layers(field)
     if maps:
         scaled = [1e6 * v if n.startswith("distance") else v for n, v in maps.items()]
         units = [f"{n} (µm)" if n.startswith("distance") else n for n in maps]
-        yield Series(
-            name="depth", values=np.stack(scaled)[None], channels=units, spacing=every(1.0)
-        )
+        yield one("depth", np.stack(scaled), 1.0, units)
     if field.views is not None:
-        views = field.views[:, :, None] if colours is None else colours.views
-        assert views is not None  # kept in colour where they are kept in grey
-        yield one("views", views.reshape(-1, *views.shape[2:]), 1.0, along="T")
+        # kept in colour where they are kept in grey
+        views = field.views if colours is None else colours.views
+        yield one("views", views, 1.0, names, along="T")
 
 
 def _write_exr(path: Path, field: LightField, provenance: "Provenance", overwrite: bool) -> None:
@@ -138,26 +146,54 @@ def _write_exr(path: Path, field: LightField, provenance: "Provenance", overwrit
     from plenocli.files.artefacts.provenance import provenance_texts
     from plenocli.files.images.exr import write_exr
 
-    colours, best = field.colours, int(np.argmax(field.sharpness))
-    channels = {"Y": field.pictures[best] if field.sharp is None else field.sharp}
+    colours, best = field.colours, (int(np.argmax(field.sharpness)),)
+    grey = (field.pictures, best) if field.sharp is None else (field.sharp, ())
+    channels = {"Y": _plane(*grey).through(np.nan_to_num)}
     if colours is not None:
-        own = colours.pictures[best] if colours.sharp is None else colours.sharp
-        channels |= dict(zip("RGB", colours.rgb(np.nan_to_num(own))))
+        own = (colours.pictures, best) if colours.sharp is None else (colours.sharp, ())
+        channels |= _rgb(colours, *own)
+    depths = ("slope", "sigma", "distance", "distance_sigma")
     for name, values in _layers(field).items():
-        channels["Z" if name == "distance" else name] = np.kron(values, np.ones((STEP, STEP)))
-    for number, picture in enumerate(field.pictures):
-        layer = f"plane{number:03d}"
+        whole = values if name in depths else np.nan_to_num(values)
+        channels["Z" if name == "distance" else name] = _by_point(whole)
+    for number in range(len(field.slopes)):
         if colours is None:
-            channels[f"{layer}.Y"] = picture
+            layer = {"Y": _plane(field.pictures, (number,)).through(np.nan_to_num)}
         else:
-            rgb = colours.rgb(np.nan_to_num(colours.pictures[number]))
-            channels |= {f"{layer}.{name}": values for name, values in zip("RGB", rgb)}
-    depths = ("Z", "slope", "sigma", "distance_sigma")
-    whole = {n: v if n in depths else np.nan_to_num(v) for n, v in channels.items()}
+            layer = _rgb(colours, colours.pictures, (number,))
+        channels |= {f"plane{number:03d}.{name}": plane for name, plane in layer.items()}
     texts = {"slopes": " ".join(f"{s:.9g}" for s in field.slopes)}
     if field.distances is not None:
         texts["distances"] = " ".join(f"{d:.9g}" for d in field.distances)
-    write_exr(path, whole, texts | provenance_texts(provenance), overwrite=overwrite)
+    write_exr(path, channels, texts | provenance_texts(provenance), overwrite=overwrite)
+
+
+def _plane(values: Any, lead: tuple[Any, ...]) -> Plane:
+    """One picture, or its channels, of several."""
+    return Plane(values.shape[-2:], lambda rows, columns: values[(*lead, rows, columns)])
+
+
+def _rgb(colours: Colours, values: Any, lead: tuple[int, ...]) -> dict[str, Plane]:
+    """Linear sRGB of a picture of several channels, 0 where it is not known."""
+
+    def only(number: int) -> Plane:
+        def one(part: np.ndarray) -> np.ndarray:
+            return np.nan_to_num(colours.rgb(np.nan_to_num(part))[number])
+
+        return _plane(values, (*lead, EVERYTHING)).through(one)
+
+    return {name: only(number) for number, name in enumerate("RGB")}
+
+
+def _by_point(values: np.ndarray) -> Plane:
+    """A map of lenslets, each as often as it has points in a picture."""
+    shape = STEP * values.shape[0], STEP * values.shape[1]
+
+    def read(rows: slice, columns: slice) -> np.ndarray:
+        places = (np.arange(*part.indices(n)) // STEP for part, n in zip((rows, columns), shape))
+        return values[np.ix_(*places)]
+
+    return Plane(shape, read)
 
 
 def _colours(colours: Colours) -> dict[str, Any]:

@@ -56,7 +56,6 @@ def refocused(
     optics: Optics | MicroscopeOptics | None = None,
     grow: bool = False,
     room: Room = in_memory,
-    copies: int = 1,
     keeper: Keeper = FORGETFUL,
 ) -> LightField:
     """Planes, depth map and views of the samples of a capture.
@@ -67,18 +66,18 @@ def refocused(
     grow: widens evenly spaced slopes, three or more, until what has texture is within them.
     room: what gives arrays for pictures by their shape; rows of their last two axes are put into
         them, one band after the other.
-    copies: of all pictures that there are in memory at a time, in the end; for what is needed.
     keeper: of what is finished, all but pictures; what it tells of these counts where `room` still
         has them, from an earlier run.
 
     Raises NumericsError where memory does not suffice, InputError where no pixel is lit.
     docs/model.md, "Refocusing and depth".
     """
-    _require(source, slopes, views, copies, WIDER if grow else 1)
+    held = room is in_memory
+    _require(source, slopes, views, held, WIDER if grow else 1)
     found = None
     if len(slopes) >= 3 and grow:
         found, slopes = depth_in_reach(source, slopes.tolist(), keeper=keeper)
-        _require(source, slopes, views, copies)
+        _require(source, slopes, views, held)
     elif len(slopes) >= 3:
         found = depth(source, slopes.tolist(), keeper=keeper)
     if found is not None and optics is not None:
@@ -104,10 +103,10 @@ def refocused(
 
 
 def _require(
-    source: SampleBands, slopes: np.ndarray, views: int, copies: int, wider: int = 1
+    source: SampleBands, slopes: np.ndarray, views: int, held: bool, wider: int = 1
 ) -> None:
-    """NumericsError where there is not the memory to refocus; wider: times as many planes that may
-    be tried, see WIDER; the others as of `refocused`.
+    """NumericsError where there is not the memory to refocus; held: whether it holds all pictures;
+    wider: times as many planes that may be tried, see WIDER; the others as of `refocused`.
     """
     lenslets, colours = source.shape[0] * source.shape[1], source.count
     reach = math.ceil(float(np.abs(slopes).max()) * math.sqrt(0.5) * STEP) + 1
@@ -117,10 +116,10 @@ def _require(
     needed += WAITING_BYTES * min(len(source.rows) - 1, WAITING)
     needed += lenslets * max(MAP_BYTES, 4 * wider * len(slopes)) * (len(slopes) >= 3)
     fewer = "cut the capture"
-    if copies:
+    if held:
         values = (len(slopes) + 1) * STEP**2 + views**2
-        needed += 4 * copies * lenslets * values * (1 if source.channels is None else 1 + colours)
-        fewer = "take an .h5, whose pictures stay in a file, or fewer planes"
+        needed += 4 * lenslets * values * (1 if source.channels is None else 1 + colours)
+        fewer = "take fewer planes"
     budget().require(needed, "refocusing", source.where, fewer)
 
 

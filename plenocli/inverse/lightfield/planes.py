@@ -11,13 +11,11 @@ points nearer to the camera have s > 0. Refocusing puts every sample at its x. S
 docs/model.md, "Refocusing and depth"; R. Ng et al., Stanford CTSR 2005-02.
 """
 
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from plenocli.base.tiling import InParts
 from plenocli.inverse.lightfield.samples import Channels
 
 
@@ -97,16 +95,6 @@ class LightField:
     sharp: np.ndarray | None = None
     views: np.ndarray | None = None
     colours: Colours | None = None
-
-    def in_memory(self) -> "LightField":
-        """The same, with all pictures in memory that are InParts."""
-        return _in_memory(replace(self, colours=self.colours and _in_memory(self.colours)))
-
-
-def _in_memory(pictures: Any) -> Any:
-    """A light field, or its colours, with what is InParts in memory."""
-    parts = {name: v.whole() for name, v in vars(pictures).items() if isinstance(v, InParts)}
-    return replace(pictures, **parts)
 
 
 def slope_of(

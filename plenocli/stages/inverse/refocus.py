@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from plenocli.inverse.lightfield.planes import DepthMap, LightField
     from plenocli.inverse.lightfield.samples import SampleBands
 
-COPIES = {".h5": 0, ".tif": 2, ".tiff": 2, ".exr": 7}
-"""How often all pictures are in memory while a file of a suffix is written (measured)."""
 LARGE = 64
 """Bands of samples, times planes, from which on what is finished is kept: some seconds of work."""
 
@@ -148,13 +146,13 @@ def _refocused(
     optics: Optics | MicroscopeOptics | None,
     tried: np.ndarray,
 ) -> _Refocused:
-    """The light field of one capture. What becomes an artefact is kept beside it meanwhile, and of
-    a large one all that is finished, for a run after one that was killed.
+    """The light field of one capture, kept beside its file meanwhile, and of a large one all that
+    is finished, for a run after one that was killed.
     """
     from plenocli.base.tiling import FORGETFUL
     from plenocli.files.artefacts.provenance import describe_inputs
     from plenocli.files.scratch import Scratch
-    from plenocli.inverse.lightfield.light_field import in_memory, refocused
+    from plenocli.inverse.lightfield.light_field import refocused
 
     target = targets[capture]
     source = _source(capture, settings.calibration, target)
@@ -164,19 +162,15 @@ def _refocused(
     bench = _bench(
         target, source, tried, (replace(settings, calibration=None, camera=None), inputs)
     )
-    in_file = bench is not None or target.suffix == ".h5"
     field = refocused(
         source,
         tried,
         views=settings.views,
         optics=optics,
         grow=not (settings.slopes or settings.distances),
-        room=Scratch(target, bench) if in_file else in_memory,
-        copies=COPIES[target.suffix],
+        room=Scratch(target, bench),
         keeper=bench or FORGETFUL,
     )
-    if in_file and target.suffix != ".h5":
-        field = field.in_memory()
     return _Refocused(field=field, source=source, inputs=inputs)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -29,8 +28,6 @@ CLEARER_DB = 3.0
 from which on that is told.
 """
 SUFFIXES = (".h5", ".tif", ".tiff")
-COPIES = 3
-"""How often a volume is in memory while its OME-TIFF is written (measured)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -154,7 +151,7 @@ def run_volume(
         tiles = Tiles(stack, measurement, method, **how)
     if other is not None:
         tiles.like = same_voxels(other, stack, (rows, columns), str(like))
-    _plan(output, tiles)
+    _say_windows(tiles)
     if background == "auto":
         _take_haze(tiles)
     files, settings = describe_inputs(inputs), (hold_out, background, most_planes, channel, seed)
@@ -244,27 +241,11 @@ def _supported(tiles: Tiles, most: int) -> tuple[Stack, tuple[Trial, ...]]:
     return stack, trials
 
 
-def _plan(output: Path, tiles: Tiles) -> None:
-    """Say in how many windows it is done.
-
-    Raises NumericsError where an OME-TIFF of the volume has no room in memory.
-    """
-    from plenocli.base.budget import budget
-
+def _say_windows(tiles: Tiles) -> None:
+    """Say in how many windows it is done."""
     if len(tiles.windows) > 1:
         size = by(tiles.windows[0].weight.shape)
         note(f"in {len(tiles.windows)} windows of {size} lenslets: --mem-limit allows no more")
-    if output.suffix == ".h5":
-        return
-    rows, columns, _ = tiles.measurement.signal.shape
-    stack, channels = tiles.stack, 1 if tiles.method in ("rl", "tv") else 2
-    voxels = len(stack.depth) * rows * columns * math.prod(stack.point_shape)
-    budget().require(
-        4 * COPIES * channels * voxels,
-        "an OME-TIFF of this volume",
-        output,
-        "take an .h5, whose planes stay in a file, or fewer planes",
-    )
 
 
 def _keep(output: Path, tiles: Tiles, depends: Any) -> None:

@@ -85,7 +85,7 @@ def test_bands_give_what_one_piece_gives(monkeypatch, tmp_path, kind, cfa):
         monkeypatch.setattr(module, "AT_ONCE", 3 * PITCH**2 * COLUMNS // 2)
     stored = replace(shot, mosaic=Plane(shot.shape, window))
     source = gather.bands_of(stored, calibration)
-    parts = refocused(source, slopes, views=2, room=Scratch(tmp_path / "out.h5"), copies=0)
+    parts = refocused(source, slopes, views=2, room=Scratch(tmp_path / "out.h5"))
     assert not list(tmp_path.iterdir())
     assert len(source.rows) > ROWS / 2 and len(read) > ROWS and min(read) < 5 * PITCH
     assert np.nanmedian(parts.depth.slope) == pytest.approx(0.5, abs=0.15)
@@ -107,7 +107,9 @@ def test_bands_give_what_one_piece_gives(monkeypatch, tmp_path, kind, cfa):
         np.testing.assert_allclose(ours, theirs, rtol=1e-5, atol=1e-6)
 
 
-@pytest.mark.parametrize("in_file, words", [(True, "cut the capture"), (False, "take an .h5")])
+@pytest.mark.parametrize(
+    "in_file, words", [(True, "cut the capture"), (False, "take fewer planes")]
+)
 def test_what_does_not_fit_is_refused_before_a_pixel_is_read(tmp_path, in_file, words):
     """A sensor of a million lenslets: in a file its pictures need a fraction of what they hold."""
     shape = 2400, 2400
@@ -123,11 +125,11 @@ def test_what_does_not_fit_is_refused_before_a_pixel_is_read(tmp_path, in_file, 
         white=White(level=None, flat=white),
     )
     source = gather.bands_of(Capture(mosaic=Plane(shape, unread)), calibration)
-    room = {"room": Scratch(tmp_path / "out.h5"), "copies": 0} if in_file else {}
+    room = {"room": Scratch(tmp_path / "out.h5")} if in_file else {}
     with (
         within(Budget(30 << 20 if in_file else 300 << 20)),
         pytest.raises(NumericsError, match=f"refocusing needs about .*{words}"),
     ):
         refocused(source, np.linspace(-3, 3, 13), **room)
     with within(Budget(300 << 20)), pytest.raises(AssertionError, match="asked for"):
-        refocused(source, np.linspace(-3, 3, 13), room=Scratch(tmp_path / "out.h5"), copies=0)
+        refocused(source, np.linspace(-3, 3, 13), room=Scratch(tmp_path / "out.h5"))

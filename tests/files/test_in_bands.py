@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -59,9 +60,9 @@ WRITERS = {
 }
 
 
-def kept(path, folder, **how):
+def kept(path, folder, memory=LITTLE, **how):
     """The capture of a file whose mosaic has no room in memory."""
-    with within(LITTLE):
+    with within(memory):
         return capture_in_file(path, room=Scratch(folder / "out.h5"), **how)
 
 
@@ -84,6 +85,58 @@ def test_what_stays_in_a_file_is_what_was_written(tmp_path, name):
         assert part.dtype == whole.mosaic.dtype
     assert found.levels.white == whole.levels.white and found.cfa == whole.cfa
     assert found.metadata == whole.metadata and found.exposure_s == whole.exposure_s
+
+
+@pytest.mark.parametrize(
+    "how", [{}, {"compression": "zlib", "rowsperstrip": 50}, {"byteorder": ">", "tile": (64, 64)}]
+)
+@pytest.mark.parametrize("dtype", [np.uint16, np.float32])
+def test_pages_of_a_stack_are_averaged_one_by_one(tmp_path, how, dtype):
+    pages = np.stack([numbers(dtype, seed) for seed in range(5)])
+    if dtype == np.float32:
+        pages /= 7
+    said = {"photometric": "minisblack", "metadata": {"axes": "IYX"}}
+    tifffile.imwrite(tmp_path / "x.tif", pages, **said, **how)
+    found = kept(tmp_path / "x.tif", tmp_path, Budget(8 << 20))  # a page twice
+    whole = read_capture(tmp_path / "x.tif").mosaic
+    assert isinstance(found.mosaic, Plane)
+    part = found.mosaic.read(slice(0, 1111), slice(0, 743))
+    for mean in (part, whole):
+        assert mean.dtype == pages.mean(axis=0).dtype
+        np.testing.assert_array_equal(mean, pages.mean(axis=0))
+    content = (tmp_path / "x.tif").read_bytes()
+    (tmp_path / "x.tif").write_bytes(content[: len(content) // 2])
+    with pytest.raises(InputError):
+        kept(tmp_path / "x.tif", tmp_path, Budget(8 << 20))
+
+
+def interlaced(path, values):
+    """A PNG of 16 bits in the seven passes of Adam7, as its specification has them."""
+    firsts, steps = [(0, 0), (0, 4), (4, 0), (0, 2), (2, 0), (0, 1), (1, 0)], [8, 8, 4, 4, 2, 2, 1]
+    passes = [
+        values[row :: max(step, 2 * row), column :: max(step, 2 * column)]
+        for (row, column), step in zip(firsts, steps)
+    ]
+    lines = [b"\0" + line.astype(">u2").tobytes() for part in passes for line in part]
+    sides = b"".join(n.to_bytes(4, "big") for n in values.shape[::-1])
+    chunks = [(b"IHDR", sides + bytes([16, 0, 0, 0, 1])), (b"IDAT", zlib.compress(b"".join(lines)))]
+    with open(path, "wb") as file:
+        file.write(b"\x89PNG\r\n\x1a\n")
+        for name, content in (*chunks, (b"IEND", b"")):
+            file.write(len(content).to_bytes(4, "big") + name + content)
+            file.write(zlib.crc32(name + content).to_bytes(4, "big"))
+
+
+def test_an_interlaced_png_counts_whole(tmp_path):
+    values = numbers(np.uint16)
+    interlaced(tmp_path / "x.png", values)
+    part = kept(tmp_path / "x.png", tmp_path).mosaic.read(slice(0, 1111), slice(0, 743))
+    np.testing.assert_array_equal(part, values)
+    with within(Budget(3 << 19)), pytest.raises(NumericsError, match="holds an interlaced PNG"):
+        capture_in_file(tmp_path / "x.png", room=Scratch(tmp_path / "out.h5"))
+    WRITERS["x.png"](tmp_path / "plain.png", values)
+    with within(Budget(3 << 19)):
+        capture_in_file(tmp_path / "plain.png", room=Scratch(tmp_path / "out.h5"))
 
 
 def test_what_is_small_beside_the_memory_is_held(tmp_path):

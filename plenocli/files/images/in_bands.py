@@ -31,28 +31,32 @@ def rows_of(line: int) -> int:
 
 
 def whole_bands(
-    path: str | os.PathLike[str], parts: Iterable[Any], shape: tuple[int, ...]
+    path: str | os.PathLike[str], parts: Iterable[Any], shape: tuple[int, ...], count: int = 1
 ) -> Iterator[np.ndarray]:
-    """Bands of rows that a decoder sends; InputError where they are not those of a picture of a
-    shape (row, column, ...).
+    """Bands of rows that a decoder sends; InputError where they are not those of `count` pictures
+    of a shape (row, column, ...), one after the other.
     """
     rows = 0
     for part in parts:
-        fits = isinstance(part, np.ndarray) and part.shape[1:] == shape[1:] and len(part) > 0
+        fits = isinstance(part, np.ndarray) and part.shape[1:] == shape[1:]
+        fits = fits and 0 < len(part) <= shape[0] - rows % shape[0]
         rows += len(part) if fits else 0
-        if not fits or rows > shape[0]:
+        if not fits or rows > count * shape[0]:
             break
         yield part
     else:
-        if rows == shape[0]:
+        if rows == count * shape[0]:
             return
     raise InputError("came back incomplete from its decoder", path, _FIX)
 
 
 def put_together(
-    parts: Iterable[np.ndarray], shape: tuple[int, ...], room: Room | None = None
+    parts: Iterable[np.ndarray],
+    shape: tuple[int, ...],
+    room: Room | None = None,
+    count: int = 1,
 ) -> np.ndarray | Plane:
-    """The picture of all bands of rows, whose number is that of `shape`.
+    """The picture of all bands of rows, or the mean of `count` pictures, one after the other.
 
     shape: (row, column), or with channels behind them where it is held.
     room: where it is put if it is more than a SHARE of the memory; None: it is held in any case.
@@ -60,14 +64,23 @@ def put_together(
     Raises what parts raise; NumericsError or OutputError where there is no room.
     """
     kept: Any = None
-    is_held, top = True, 0
+    is_held, row = True, 0
     for part in parts:
+        picture, top = divmod(row, shape[0])
+        rows, row = slice(top, top + len(part)), row + len(part)
+        if count > 1:
+            part = _summed(part, kept[rows] if picture else 0, count if picture == count - 1 else 1)
         if kept is None:
             is_held = room is None or math.prod(shape) * part.itemsize <= budget().memory // SHARE
             kept = np.empty(shape, part.dtype) if is_held else _there(room)(shape, part.dtype)
-        kept[top : top + len(part)] = part
-        top += len(part)
+        kept[rows] = part
     return kept if is_held else Plane((shape[0], shape[1]), lambda *window: kept[window])
+
+
+def _summed(part: np.ndarray, before: Any, over: int) -> np.ndarray:
+    """A band added to those before it, as np.mean does it."""
+    exact = np.float32 if part.dtype.kind == "f" and part.itemsize < 8 else np.float64
+    return np.asarray((before + part.astype(exact)) / exact(over))
 
 
 def _there(room: Room | None) -> Room:

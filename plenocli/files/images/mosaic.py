@@ -70,9 +70,9 @@ def _read(path: Path, cfa: str | None, room: Room | None) -> Capture:
     elif is_hdf5(path):
         found = _from_artefact(path)
     elif first_bytes(path, len(LYTRO)) == LYTRO:
-        found = _contained(path, read_lytro(path))
+        found = _contained(path, read_lytro(path, room))
     elif path.suffix.lower() in BIO:
-        found = _of_values(path, read_bio(path), cfa or "mono")
+        found = _of_values(path, read_bio(path, room), cfa or "mono")
     else:
         is_dng = kind == "tiff" and path.suffix.lower() == ".dng"
         found = _from_raw(path, "dng" if is_dng else "raw", read_raw(path, room))
@@ -362,8 +362,9 @@ def _from_raw(path: Path, source: str, found: RawFile) -> Capture:
 def _contained(path: Path, found: Contained) -> Capture:
     with _sensible(path):
         told = _told(path, "raw", found.details, None)
+    mosaic: Any = found.values
     return Capture(
-        mosaic=found.values,
+        mosaic=mosaic,
         cfa=found.cfa,
         levels=Levels(black=found.black, white=found.white),
         exposure_s=found.exposure_s,
@@ -372,18 +373,19 @@ def _contained(path: Path, found: Contained) -> Capture:
     )
 
 
-def _of_values(path: Path, values: np.ndarray, cfa: str, white: float | None = None) -> Capture:
-    """A mosaic of which a file says nothing but its numbers."""
-    if values.dtype.kind not in "uf":
-        raise InputError(f"holds {values.dtype} values", path, "give unsigned integers or float")
+def _of_values(path: Path, values: Any, cfa: str, white: float | None = None) -> Capture:
+    """A mosaic, in memory or in a file, of which a file says nothing but its numbers."""
+    of = Plane.of(values).read(slice(0, 1), slice(0, 1)).dtype
+    if of.kind not in "uf":
+        raise InputError(f"holds {of} values", path, "give unsigned integers or float")
     if white is None:
-        white = float(np.iinfo(values.dtype).max) if values.dtype.kind == "u" else np.inf
+        white = float(np.iinfo(of).max) if of.kind == "u" else np.inf
     metadata = CaptureMetadata(source="image", path=path, details={"verified": False})
     return Capture(mosaic=values, cfa=cfa, levels=Levels(white=white), metadata=metadata)
 
 
 def _from_image(path: Path, kind: str, cfa: str, room: Room | None) -> Capture:
-    pages = read_pages(path) if kind == "tiff" else None
+    pages = read_pages(path, room) if kind == "tiff" else None
     if pages is not None:
         return _of_values(path, pages.values, cfa, pages.white)
     head, parts = stored_in_parts(path, kind, held=room is None)

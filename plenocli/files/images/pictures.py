@@ -29,6 +29,8 @@ _MAGIC = (
     (b"II+\0", "tiff"),
     (b"MM\0+", "tiff"),
 )
+_INTERLACED = 28
+"""The byte of a PNG that says whether its rows come in several passes."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -187,7 +189,10 @@ def _decoded(path: str, kind: str, most: int | None, held: bool) -> Iterator[Any
         line = spec.width * spec.nchannels * size
         require_at_most(path, declared, most)
         rows = min(spec.tile_height or rows_of(line), spec.height)
-        budget().require_declared(path, declared, (declared if held else 0) + 4 * rows * line)
+        needed, why = (declared if held else 0) + 4 * rows * line, ""
+        if kind == "png" and first_bytes(path, _INTERLACED + 1)[_INTERLACED]:
+            needed, why = needed + declared, ": its decoder holds an interlaced PNG whole"
+        budget().require_declared(path, declared, needed, why=why)
         container = 8 * size
         bits = spec.get_int_attribute("oiio:BitsPerSample", container)
         whole = spec.format.basetype in (oiio.UINT8, oiio.UINT16, oiio.UINT32)

@@ -214,7 +214,7 @@ class Notebook:
         return Notebook(self.known, self.most, f"{self.prefix}{name}.")
 
 
-@pytest.mark.parametrize("own", [False, True])
+@pytest.mark.parametrize("own", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_solutions_that_an_earlier_run_left_give_the_same_bytes(bench, checkerboard, own):
     """Of a capture that moved, whichever solution was the last."""
     camera, calibration, _, shoot = bench

@@ -6,14 +6,16 @@ import shutil
 import subprocess
 import sys
 import time
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
 
-from plenocli.base.budget import Budget, within
+from plenocli.base.budget import Budget, budget, within
 from plenocli.base.errors import NumericsError
 from plenocli.cli.main import run
 from plenocli.evaluation.metrics.quality import psnr
+from plenocli.execution.pool import InProcess
 from plenocli.files.artefacts.reading import Stored, read_artefact
 from plenocli.files.read import captures
 from plenocli.inverse.picture import tiles
@@ -287,3 +289,21 @@ def test_tiles_side_by_side_unpack_their_rows_once(folder, small_tiles, tmp_path
     other = picture(tmp_path / "alone", tmp_path / "other.h5", method="block-mean")
     np.testing.assert_array_equal(first.data["image/value"], kept.data["image/value"])
     assert np.abs(other.data["image/value"] - first.data["image/value"]).max() > 0.01
+
+
+@pytest.mark.parametrize(("several", "threads"), [(False, 3), (True, 1)])
+def test_workers_of_several_captures_take_one_thread_each(
+    folder, small_tiles, tmp_path, monkeypatch, several, threads
+):
+    made, seen = folder[0] / "alone", []
+    names = [str(made / "capture.h5"), str(shutil.copy(made / "capture.h5", tmp_path / "b.h5"))]
+    survey = in_tiles.survey
+    monkeypatch.setattr(
+        in_tiles, "survey", lambda *task: seen.append(budget().threads) or survey(*task)
+    )
+    # tasks run here, whatever the pool
+    monkeypatch.setattr(stage, "open_pool", lambda *_, **__: nullcontext(InProcess()))
+    command = ["reconstruct", *names[: 1 + several], "--pif", str(made / "pif.h5")]
+    command += ["--method", "lmmse", "--workers", "3", "-o"]
+    assert run([*command, str(tmp_path / ("out" if several else "out.h5"))]) == 0
+    assert seen == [threads] * (1 + several)

@@ -5,6 +5,7 @@ neighbours.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -74,12 +75,14 @@ def run_reconstruct(
     split = not batch.several
     workers = settings.workers if split else min(settings.workers, len(batch.todo))
     pooled = scheduler is not None or workers > 1
-    recipe = recipe_of(settings, pif, calibration, pooled, elsewhere=scheduler is not None)
+    # of several captures each is one worker's
+    own = settings if split else replace(settings, workers=1)
+    recipe = recipe_of(own, pif, calibration, pooled, elsewhere=scheduler is not None)
 
     def write(solved: Solved, capture: Path, target: Path) -> PictureSummary:
         inputs = solved.capture | _inputs(settings, pif, calibration)
         # of a single one nothing is estimated any more
-        with on_threads(settings.workers if split else 1):
+        with on_threads(own.workers):
             return write_picture(target, solved, settings, command, inputs, overwrite)
 
     try:

@@ -115,7 +115,10 @@ def main(argv: list[str] | None = None) -> None:
     try:
         sys.exit(run(argv))
     finally:
-        gc.freeze()  # or a process that ends looks through all it has for garbage, three times
+        # or a process that ends looks through all it has for garbage, three times; what OpenImageIO
+        # misses then it tells on stderr
+        if "OpenImageIO" not in sys.modules:
+            gc.freeze()
 
 
 def run(argv: list[str] | None = None) -> int:

@@ -1,6 +1,8 @@
 """The error boundary: exit codes, one message, no traceback."""
 
 import errno
+import subprocess
+import sys
 
 import pytest
 
@@ -13,6 +15,8 @@ from plenocli.base.errors import (
     UsageError,
 )
 from plenocli.cli import main as boundary
+from plenocli.files.config.camera_file import to_toml
+from tests.forward.propagation.cameras import small_camera
 
 
 @pytest.mark.parametrize(
@@ -114,3 +118,14 @@ def test_the_system_s_errors_have_exit_codes(monkeypatch, capfd, number, filenam
     monkeypatch.setattr(boundary.cli, "main", fail)
     assert boundary.run([]) == code
     assert "sorry" in capfd.readouterr().err
+
+
+def test_a_command_that_wrote_an_exr_ends_without_a_word_of_its_library(tmp_path):
+    """Which tells on stderr of what a process that ends does not clear away."""
+    camera = small_camera(lenslet_array__count=(2, 2))
+    (tmp_path / "camera.toml").write_text(to_toml(camera))
+    words = ["capture-sim", "camera.toml", "--scene", "skimage:camera", "--superpixels", "1x1"]
+    words += ["--coherent-ring", "0", "--accuracy", "3e-2", "--noise", "none", "-o", "out.exr"]
+    command = [sys.executable, "-m", "plenocli", "--quiet", *words]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "") and (tmp_path / "out.exr").exists()

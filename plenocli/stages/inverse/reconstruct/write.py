@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from plenocli.base.tiling import InParts
+from plenocli.base.tiling import InParts, Plane
 from plenocli.stages.inverse.reconstruct.recipe import Settings
 from plenocli.stages.inverse.reconstruct.solved import PictureSummary, Solved
 
@@ -42,21 +42,37 @@ def _write_exr(
     from plenocli.files.images.exr import write_exr
     from plenocli.files.images.spectral_exr import write_spectral_exr
 
-    picture, sigma = _in_memory(solved.found.value), _in_memory(solved.found.sigma)
+    parts = {"Y": solved.found.value} | (
+        {} if solved.found.sigma is None else {"sigma": solved.found.sigma}
+    )
     attrs = {"method": solved.found.method} | provenance_texts(provenance)
-    if picture.ndim == 3:
+    if len(parts["Y"].shape) == 3:
+        whole = {n: v.whole() if isinstance(v, InParts) else v for n, v in parts.items()}
         write_spectral_exr(
-            target, solved.bands, picture, sigma=sigma, attrs=attrs, overwrite=overwrite
+            target,
+            solved.bands,
+            whole["Y"],
+            sigma=whole.get("sigma"),
+            attrs=attrs,
+            overwrite=overwrite,
         )
-    else:
-        channels = {"Y": picture} | ({} if sigma is None else {"sigma": sigma})
-        channels |= {} if solved.rgb is None else dict(zip("RGB", solved.rgb))
-        channels = {name: values.astype(np.float32) for name, values in channels.items()}
-        write_exr(target, channels, attrs, overwrite=overwrite)
+        return
+    parts |= {} if solved.rgb is None else dict(zip("RGB", solved.rgb))
+    channels = {name: _by_lines(target, values) for name, values in parts.items()}
+    write_exr(target, channels, attrs, overwrite=overwrite)
 
 
-def _in_memory(values: Any) -> Any:
-    return values.whole() if isinstance(values, InParts) else values
+def _by_lines(target: Path, values: np.ndarray | InParts) -> np.ndarray | Plane:
+    """A picture of which lines are asked for in any order: of parts from a file beside `target`."""
+    from plenocli.files.scratch import Scratch
+
+    if not isinstance(values, InParts):
+        return values
+    kept, top = Scratch(target)(values.shape), 0
+    for part in values.parts():
+        kept[top : top + len(part)] = part
+        top += len(part)
+    return Plane(values.shape, lambda rows, columns: kept[rows, columns])
 
 
 def _write_artefact(

@@ -2,6 +2,7 @@
 what must hold of it.
 """
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -862,3 +863,26 @@ def test_grids_that_are_no_squares_hold_parts_of_a_fine_one(nearer):
         part = fine[rows, columns]
         missed = np.sqrt(((matrix(superpixels, 1e-3) - part) ** 2).sum(axis=(0, 1, 2)))
         assert (missed <= 1e-3 * np.sqrt((part**2).sum(axis=(0, 1, 2)))).all()
+
+
+@pytest.mark.parametrize(
+    "f_number, fill, asked", [(1.5, 0.6, 1e-4), (2.5, 0.6, 1e-5), (1.5, 0.9, 1e-5)]
+)
+def test_dim_points_between_lenslets_and_steep_corners_hold(f_number, fill, asked):
+    """All columns of 3x3 superpixels, against those at a tenth: points that few lenslets light and
+    corners are the first that what all lenslets together may lose is too much for.
+    """
+    camera = fast_camera(f_number, lenslet_array__fill_factor=fill)
+    found, fine = (
+        columns_of(camera, one, superpixels=(3, 3), coherent_ring=1) for one in (asked, asked / 10)
+    )
+    off = np.linalg.norm(found - fine, axis=0) / np.linalg.norm(fine, axis=0)
+    assert off.max() < asked
+
+
+def columns_of(camera, asked, **request):
+    """All columns of a matrix by the exact model, (pixel, point)."""
+    plan = accuracy.plan_pif(camera, model="exact", accuracy=asked, **request)
+    builder = PifBuilder(camera, WAVELENGTH, plan, dtype=np.float64)
+    found = builder.columns(list(range(math.prod(builder.object_shape))))
+    return found.reshape(-1, found.shape[2])

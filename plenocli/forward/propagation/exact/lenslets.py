@@ -68,13 +68,20 @@ SPILL = 0.25
 what a lenslet's far edge diffracts there is up to 0.23 of it (two cameras, f/4.4 and f/8).
 """
 
-DIM, CONCENTRATION, EVENLY, WORST = 4.0, 0.7, 0.35, 0.5
+DIM, CONCENTRATION, EVENLY, WORST = 4.0, 0.7, 0.35, 0.25
 """On superpixels beside the own one. Errors of dim light may be as large as what adds so many cuts
 to the light by their own energy. Of what lenslets may lose, of all points together, those that
 count most take more than their share: 1 would leave them none of it, 0 all. (What narrowing takes
 is spread more evenly, at most 3.5 times the mean at f/4.4.) No point may lose more than so many
 cuts where terms are left out, by its own light where that is less than the dimmest that was tried.
-(Worst columns of two cameras, 5e-2 to 1e-4, as where all points count fully.)
+(Worst columns of two cameras, 5e-2 to 1e-4, as where all points count fully; points between
+lenslets of a fill of 0.6 lost up to 1.4 times what was asked with twice as many, at f/1.5 and
+f/2.5.)
+"""
+
+FINE = 5e-5
+"""Accuracy from which on each of many lenslets loses a third as much: corners of steep ones lost
+1.8 times what was asked at 1e-5 (f/1.5), 0.9 at 1e-4.
 """
 
 LEAST = 1e-10
@@ -440,6 +447,10 @@ class ExactSquareLenslets(LensletFields):
         kept = [key for key, power in zip(order, total) if power > least**2] or order[-1:]
         return {key: pairs[key] for key in kept}
 
+    @property
+    def _fine(self) -> bool:
+        return self.band.cut < CUT * FINE * self.band.faintest
+
     def _lit(self, sy: int, sx: int) -> _Lit:
         """Superpixel (sy, sx) and the light that is followed to it."""
         weights = [self._counts(s, axis, bool(sy and sx)) for s, axis in ((sy, 0), (sx, 1))]
@@ -452,7 +463,7 @@ class ExactSquareLenslets(LensletFields):
             at=(sy, sx),
             symmetric=self._turn and sy == sx,
             kept=kept,
-            cut=cut / 2,
+            cut=cut / (6 if len(kept) > 1 and self._fine else 2),
             narrowing=self.band.cut * mean**EVENLY / 2 * all_points,
             whole=self.band.cut * all_points,
             guess=guess,

@@ -127,6 +127,7 @@ def lmmse(folder, out, *more):
     return read_artefact(out, "image")
 
 
+@pytest.mark.slow
 def test_classes_are_no_larger_than_a_tile_and_go_on_from_those_that_are_finished(
     folder, tmp_path, monkeypatch
 ):

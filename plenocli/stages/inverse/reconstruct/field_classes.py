@@ -93,8 +93,8 @@ def picture_by_class(
     middle = int(np.argmin(places))
     found, seen = task.estimated(source, classes[middle])
     task, about = replace(task, method=found.method), describe_capture(capture)
-    bench = bench_of(target, (replace(settings, workers=1), recipe.digests, about, classes))
-    keep(bench, middle, _own(found, classes[middle]), clip=settings.clip)
+    bench = bench_of(target, recipe, about, classes)
+    keep(bench, middle, SolvedTile.of(found, classes[middle]), clip=settings.clip)
     solve_all(pool, task, classes, bench, clip=settings.clip)
     declared = sample.saturated is not None
     return put_together(
@@ -130,7 +130,7 @@ class _ClassTask:
                 beside=self.target,
                 verify=False,
             )
-            return _own(self.estimated(source, job[1])[0], job[1])
+            return SolvedTile.of(self.estimated(source, job[1])[0], job[1])
 
     def estimated(self, source: Source, each: Tile) -> tuple[Reconstruction, Seen | None]:
         """The picture of a class and its margin, and what is seen of it."""
@@ -142,13 +142,6 @@ class _ClassTask:
         data = replace(source.cut(*each.around, each.within), whole=Whole({}))
         truth, off = true_objects(self.recipe, source, each.around), self.model_error
         return estimate(own, METHODS[self.method], data, truth, model_error=off, guard=False)
-
-
-def _own(found: Reconstruction, each: Tile) -> SolvedTile:
-    """What the lenslets of a class itself show."""
-    sigma = None if found.sigma is None else found.sigma[each.within]
-    value = found.value[each.within]
-    return SolvedTile(value=value, sigma=sigma, trace=found.trace, stats=found.stats)
 
 
 def place_of(each: Tile, count: tuple[int, int], pitch: float) -> Place:

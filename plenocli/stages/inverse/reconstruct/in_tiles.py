@@ -71,7 +71,7 @@ def picture_in_tiles(
     sample, task = typical.found, typical.task
     all_weigh = METHODS[sample.method].weighs_all  # of the one that auto took
     task = task.sharing(pool, tiles if all_weigh else spread_over(source.count, side_of(system)))
-    bench = bench_of(target, (replace(settings, workers=1), recipe.digests, typical.capture, tiles))
+    bench = bench_of(target, recipe, typical.capture, tiles)
     stats = solve_all(pool, task, tiles, bench, clip=settings.clip)
     return put_together(
         replace(sample, stats=stats or sample.stats),
@@ -207,10 +207,7 @@ class _TileTask:
 
     def __call__(self, job: tuple[int, Tile]) -> SolvedTile:
         """A tile."""
-        tile, found = job[1], self._estimated(job[1], self.whole)
-        sigma = None if found.sigma is None else found.sigma[tile.within]
-        value, trace = found.value[tile.within], found.trace
-        return SolvedTile(value=value, sigma=sigma, trace=trace, stats=found.stats)
+        return SolvedTile.of(self._estimated(job[1], self.whole), job[1])
 
     def _estimated(self, tile: Tile, whole: Whole) -> Reconstruction:
         """A piece; what there is to say was said of the whole."""

@@ -19,6 +19,7 @@ from plenocli.files.bench import Bench
 from plenocli.inverse.picture.lenslet_model import LensletMatrix
 from plenocli.inverse.picture.reconstruction import Entry, Reconstruction, Stats
 from plenocli.inverse.picture.tiles import NUISANCES, Tile, counts, joined
+from plenocli.stages.inverse.reconstruct.recipe import Recipe
 from plenocli.stages.inverse.reconstruct.solved import Solved
 
 
@@ -35,6 +36,13 @@ class SolvedTile:
     sigma: np.ndarray | None
     trace: tuple[Entry, ...]
     stats: Stats | None
+
+    @classmethod
+    def of(cls, found: Reconstruction, tile: Tile) -> SolvedTile:
+        """Of the picture of a tile and what is around it."""
+        sigma = None if found.sigma is None else found.sigma[tile.within]
+        value = found.value[tile.within]
+        return cls(value=value, sigma=sigma, trace=found.trace, stats=found.stats)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,13 +97,19 @@ class HeldTiles:
         self.tiles[tile] = tuple(arrays)
 
 
-def bench_of(target: Path | None, depends: Any) -> Bench | HeldTiles:
+def bench_of(
+    target: Path | None, recipe: Recipe, capture: dict[str, Any], tiles: Sequence[Tile]
+) -> Bench | HeldTiles:
     """Where the tiles of a result are kept until it is written.
 
     target: the result; None where that is elsewhere.
-    depends: as of Bench.beside.
+    capture: as in Solved.
     """
-    return HeldTiles() if target is None else Bench.beside(target, depends)
+    if target is None:
+        return HeldTiles()
+    return Bench.beside(
+        target, (replace(recipe.settings, workers=1), recipe.digests, capture, tiles)
+    )
 
 
 def solve_all(

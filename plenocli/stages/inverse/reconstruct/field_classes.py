@@ -14,7 +14,7 @@ import numpy as np
 from plenocli.base.errors import UsageError
 from plenocli.base.progress import collected_notes, note
 from plenocli.execution.pool import Pool
-from plenocli.files.read.captures import describe_capture, superpixel_source
+from plenocli.files.read.captures import describe_capture
 from plenocli.inverse.picture.diagnosis import Seen
 from plenocli.inverse.picture.estimate import estimate
 from plenocli.inverse.picture.footprint import require_reconstruction
@@ -27,7 +27,7 @@ from plenocli.stages.inverse.reconstruct.in_tiles import (
     matrix_that_serves,
     true_objects,
 )
-from plenocli.stages.inverse.reconstruct.recipe import Recipe, estimators_of, field_of
+from plenocli.stages.inverse.reconstruct.recipe import Recipe, estimators_of, field_of, source_of
 from plenocli.stages.inverse.reconstruct.solved import Solved
 from plenocli.stages.inverse.reconstruct.tiles import (
     SolvedTile,
@@ -122,14 +122,7 @@ class _ClassTask:
         """A class; what there is to say was said of that in the middle."""
         recipe, method = self.recipe, METHODS[self.method]
         with collected_notes():
-            source = superpixel_source(
-                self.capture,
-                estimators_of(recipe).system,
-                recipe.calibration,
-                each_pixel=method.each_pixel,
-                beside=self.target,
-                verify=False,
-            )
+            source = source_of(recipe, self.capture, method.each_pixel, self.target, verify=False)
             return SolvedTile.of(self.estimated(source, job[1])[0], job[1])
 
     def estimated(self, source: Source, each: Tile) -> tuple[Reconstruction, Seen | None]:

@@ -14,7 +14,7 @@ from plenocli.base.progress import note
 from plenocli.base.tiling import Plane, bands
 from plenocli.execution.pool import InProcess, Pool
 from plenocli.files.read.calibrations import read_white
-from plenocli.files.read.captures import describe_capture, room_beside, superpixel_source
+from plenocli.files.read.captures import describe_capture, room_beside
 from plenocli.forward.sensor.cfa import cfa_map
 from plenocli.forward.sensor.superpixel import extract_rows
 from plenocli.inverse.calibration.calibration import Windows, there
@@ -41,6 +41,7 @@ from plenocli.stages.inverse.reconstruct.recipe import (
     estimators_by,
     estimators_of,
     field_of,
+    source_of,
 )
 from plenocli.stages.inverse.reconstruct.solved import Solved
 from plenocli.stages.inverse.reconstruct.truth import truth_of
@@ -74,9 +75,7 @@ def reconstruct_capture(
         return _solved(found, settings, capture, rgb=rgb)
     estimators, method = estimators_of(recipe), METHODS[settings.method]
     system = estimators.system
-    source = superpixel_source(
-        capture, system, recipe.calibration, each_pixel=method.each_pixel, beside=where
-    )
+    source = source_of(recipe, capture, method.each_pixel, where)
     tasks, tiles = pool or InProcess(), tiles_of(estimators, method, source.count)
     if field_of(recipe) is not None:
         return picture_by_class(recipe, capture, source, tasks, where)

@@ -15,6 +15,7 @@ from plenocli.base.errors import PlenoError
 from plenocli.base.progress import bar, collected_notes
 from plenocli.execution.pool import absolute, run_all
 from plenocli.files.kept import kept
+from plenocli.files.read.captures import superpixel_source
 from plenocli.files.read.dictionaries import read_dictionary
 from plenocli.files.read.system_matrices import (
     FieldMatrix,
@@ -25,6 +26,7 @@ from plenocli.files.read.training import read_training
 from plenocli.forward.camera.model import Camera
 from plenocli.inverse.picture.estimators import Estimators, Options
 from plenocli.inverse.picture.lenslet_model import LensletMatrix
+from plenocli.inverse.picture.tiles import Source
 
 if TYPE_CHECKING:
     from plenocli.inverse.prior.natural_images import TrainingPicture
@@ -156,6 +158,22 @@ def estimators_of(recipe: Recipe) -> Estimators:
         threads=recipe.threads,
         keep=kept,
         device=device_of(settings.device),
+    )
+
+
+def source_of(
+    recipe: Recipe, capture: Path, each_pixel: bool, beside: Path | None, *, verify: bool = True
+) -> Source:
+    """The superpixels of a capture, in the units of the recipe's matrix; arguments and errors as of
+    superpixel_source.
+    """
+    return superpixel_source(
+        capture,
+        estimators_of(recipe).system,
+        recipe.calibration,
+        each_pixel=each_pixel,
+        beside=beside,
+        verify=verify,
     )
 
 

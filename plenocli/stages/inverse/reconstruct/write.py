@@ -63,16 +63,16 @@ def _write_exr(
 
 
 def _by_lines(target: Path, values: np.ndarray | InParts) -> np.ndarray | Plane:
-    """A picture of which lines are asked for in any order: of parts from a file beside `target`."""
+    """A picture of which lines are asked for in any order: of parts from a file beside `target`,
+    where it is large.
+    """
+    from plenocli.files.images.in_bands import put_together
     from plenocli.files.scratch import Scratch
 
     if not isinstance(values, InParts):
         return values
-    kept, top = Scratch(target)(values.shape), 0
-    for part in values.parts():
-        kept[top : top + len(part)] = part
-        top += len(part)
-    return Plane(values.shape, lambda rows, columns: kept[rows, columns])
+    parts = (part.astype(np.float32) for part in values.parts())
+    return put_together(parts, values.shape, Scratch(target))
 
 
 def _write_artefact(

@@ -5,6 +5,7 @@ import pytest
 from scipy.fft import dctn, idctn
 from scipy.linalg import hadamard
 
+from plenocli.base.budget import on_threads
 from plenocli.evaluation.metrics.quality import psnr
 from plenocli.files.read.scenes import embedded_photograph
 from plenocli.forward.scene.sample import luminance, sample_picture
@@ -102,6 +103,20 @@ def test_strips_change_nothing(noisy, monkeypatch):
     whole = denoise.block_matching(noisy[1], 0.05)
     monkeypatch.setattr(denoise, "TOGETHER", 60)
     np.testing.assert_allclose(denoise.block_matching(noisy[1], 0.05), whole, atol=1e-6)
+
+
+@pytest.mark.parametrize("threads", [2, 5])
+def test_threads_change_no_bit(noisy, monkeypatch, threads):
+    monkeypatch.setattr(denoise, "TOGETHER", 60)
+    known = [{}, {}]
+    with on_threads(1):
+        alone = denoise.block_matching(noisy[1], 0.05, known[0])
+    with on_threads(threads):
+        found = denoise.block_matching(noisy[1], 0.05, known[1])
+    np.testing.assert_array_equal(found, alone)
+    assert len(known[0]) > 5 and known[0].keys() == known[1].keys()
+    for strip, alike in known[0].items():
+        np.testing.assert_array_equal(known[1][strip], alike)
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 7), (8, 8), (9, 30), (33, 10)])

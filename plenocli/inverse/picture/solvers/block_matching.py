@@ -15,7 +15,9 @@ from types import ModuleType
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
+from plenocli.base.budget import budget, spread
 from plenocli.base.device import beside, namespace
+from plenocli.base.tiling import bands
 
 PATCH, STEP, SEARCH, STACK = 8, 4, 9, 16
 """Side of a patch, distance of reference patches, how far similar ones are searched, how many
@@ -40,7 +42,8 @@ def block_matching(picture: np.ndarray, sigma: float, matched: Matched | None = 
     sigma: standard deviation of the noise.
     matched: what was found alike in a picture of this shape, for the next; filled where empty.
 
-    Returns (row, column) float64, where the picture is.
+    Returns (row, column) float64, where the picture is. Strips are worked on by as many threads as
+    the budget has, in NumPy's arrays.
     Dabov et al. 2007.
     """
     xp, here = namespace(picture), partial(beside, picture)
@@ -57,16 +60,38 @@ def block_matching(picture: np.ndarray, sigma: float, matched: Matched | None = 
     total, weight = here(np.zeros(picture.shape)), here(np.zeros(picture.shape))
     matched = {} if matched is None else matched
     kernel = _kernel() if xp is np and picture.size >= LARGE else None
-    together = TOGETHER if xp is np else TOGETHER_ELSEWHERE
-    for strip in np.array_split(rows, max(1, -(-len(rows) * len(columns) // together))):
-        span = slice(max(strip[0] - SEARCH, 0), min(strip[-1] + patch + SEARCH, height))
+    together, threads = (TOGETHER, budget().threads) if xp is np else (TOGETHER_ELSEWHERE, 1)
+    strips = np.array_split(rows, max(1, -(-len(rows) * len(columns) // together)))
+    spans = [
+        slice(max(strip[0] - SEARCH, 0), min(strip[-1] + patch + SEARCH, height))
+        for strip in strips
+    ]
+    most = max(span.stop - span.start for span in spans) * width * patch**2
+    rooms: dict[int, np.ndarray] = {}
+    found: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+
+    def clear(number: int) -> None:
+        strip, part = strips[number], source[spans[number], :]
         if strip[0] not in matched:
             match = _match if kernel is None else kernel.match
-            found = match(source[span, :], strip - span.start, columns, patch, SEARCH, stack)
-            matched[strip[0]] = xp.asarray(found, dtype=xp.int32)
-        one, two = _filter(source[span, :], matched[strip[0]], patch, sigma, kernel)
-        total[span, :] += one
-        weight[span, :] += two
+            like = match(part, strip - spans[number].start, columns, patch, SEARCH, stack)
+            matched[strip[0]] = xp.asarray(like, dtype=xp.int32)
+        if kernel is None:
+            found[number] = _filter(part, matched[strip[0]], patch, sigma)
+            return
+        own = number % threads
+        if own not in rooms:
+            rooms[own] = np.empty((2, most), np.float32)
+        alike = matched[strip[0]]
+        found[number] = _filter_compiled(part, alike, patch, sigma, kernel, rooms[own])
+
+    for some in bands(len(strips), threads):
+        spread([(number,) for number in range(some.start, some.stop)], clear)
+        # added up in their order, so that the sums are the same for any number of threads
+        for number in range(some.start, some.stop):
+            one, two = found.pop(number)
+            total[spans[number], :] += one
+            weight[spans[number], :] += two
     return unit * total / weight
 
 
@@ -137,7 +162,7 @@ def _smallest(values: np.ndarray, count: int) -> np.ndarray:
 
 
 def _filter(
-    source: np.ndarray, stacks: np.ndarray, patch: int, sigma: float, kernel: ModuleType | None
+    source: np.ndarray, stacks: np.ndarray, patch: int, sigma: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """(weighted sum, weights), each like source, of the filtered patches.
 
@@ -149,9 +174,8 @@ def _filter(
     cosine, _, taper = _transforms(patch, stacks.shape[1])
     rows, columns = stacks // width, stacks % width
     patches = xp.reshape(_patches(source, patch), (-1, patch * patch))
-    shrink = _shrink if kernel is None else kernel.shrink
     spectra = patches @ here(cosine.T)
-    sums, counted = shrink(spectra, rows * corners[1] + columns, THRESHOLD * sigma)
+    sums, counted = _shrink(spectra, rows * corners[1] + columns, THRESHOLD * sigma)
     planes = xp.reshape(here(cosine.T) @ xp.permute_dims(sums, (1, 0)), (patch, patch, *corners))
     counted = xp.reshape(counted, corners)
     total, weights = here(np.zeros(source.shape)), here(np.zeros(source.shape))
@@ -160,6 +184,32 @@ def _filter(
         total[there] += share * planes[r, c, :, :]
         weights[there] += share * counted
     return total, weights
+
+
+def _filter_compiled(
+    source: np.ndarray,
+    stacks: np.ndarray,
+    patch: int,
+    sigma: float,
+    kernel: ModuleType,
+    room: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """As `_filter`, by the compiled functions.
+
+    room: (2, n) float32, n at least patch^2 times the points of source; asked for anew at each
+        strip, such memory is slow to come, above all to several threads.
+    """
+    corners = (source.shape[0] - patch + 1, source.shape[1] - patch + 1)
+    cosine, _, taper = _transforms(patch, stacks.shape[1])
+    rows, columns = np.divmod(stacks, source.shape[1])
+    one, two = room[:, : corners[0] * corners[1] * patch**2].reshape(2, -1, patch**2)
+    np.copyto(one.reshape(*corners, patch, patch), _patches(source, patch))
+    spectra = np.matmul(one, cosine.T, out=two)
+    counted = kernel.shrink(spectra, rows * corners[1] + columns, THRESHOLD * sigma, one)
+    back = np.matmul(one, cosine, out=two).reshape(-1, patch, patch)
+    return kernel.put_back(
+        back, counted.reshape(corners), taper.reshape(patch, patch), source.shape
+    )
 
 
 def _patches(source: np.ndarray, patch: int) -> np.ndarray:
@@ -175,7 +225,7 @@ def _patches(source: np.ndarray, patch: int) -> np.ndarray:
 def _shrink(
     spectra: np.ndarray, stacks: np.ndarray, threshold: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """As `shrink` of the kernel, in whole arrays."""
+    """(sum, weight) as `shrink` of the kernel, in whole arrays."""
     xp, (number, count) = namespace(spectra), stacks.shape
     at = xp.reshape(xp.permute_dims(stacks, (1, 0)), (-1,))
     across = beside(spectra, _transforms(PATCH, count)[1])

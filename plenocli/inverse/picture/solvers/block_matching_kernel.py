@@ -12,7 +12,7 @@ from plenocli.inverse.compiled import compiled
 TOGETHER = 64
 """Reference patches of a row that are compared together: their distances stay in the cache."""
 
-_jit = compiled(fastmath={"reassoc", "contract", "nsz"}, forceinline=True)
+_jit = compiled(fastmath={"reassoc", "contract", "nsz"}, forceinline=True, nogil=True)
 
 
 @_jit
@@ -81,18 +81,20 @@ def match(
 
 @_jit
 def shrink(
-    spectra: np.ndarray, stacks: np.ndarray, threshold: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """(sum (patch, coefficient), weight (patch,)), float32, of what stacks make of their patches:
-    transformed across the stack (Walsh-Hadamard), coefficients below the threshold but the mean of
-    all left out, and transformed back, over how many were kept.
+    spectra: np.ndarray, stacks: np.ndarray, threshold: float, total: np.ndarray
+) -> np.ndarray:
+    """What stacks make of their patches: transformed across the stack (Walsh-Hadamard),
+    coefficients below the threshold but the mean of all left out, and transformed back, over how
+    many were kept. Returns the sum of these weights, (patch,) float32.
 
     spectra: (patch, coefficient) float32, the mean of a patch first.
     stacks: (stack, member) which patches, a power of two together.
     threshold: of orthonormal coefficients.
+    total: (patch, coefficient) float32, which becomes the weighted sum.
     """
     count, size = stacks.shape[1], spectra.shape[1]
-    total, weight = np.zeros(spectra.shape, np.float32), np.zeros(len(spectra), np.float32)
+    total[:] = 0
+    weight = np.zeros(len(spectra), np.float32)
     held = np.empty((count, size), np.float32)
     least = np.float32(threshold * np.sqrt(count))
     for members in stacks:
@@ -116,7 +118,35 @@ def shrink(
             for c in range(size):
                 into[c] += scale * row[c]
             weight[members[i]] += share
-    return total, weight
+    return weight
+
+
+@_jit
+def put_back(
+    patches: np.ndarray, counted: np.ndarray, taper: np.ndarray, shape: tuple[int, int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """(sum, weights), each a float64 plane of `shape`, of patches where they lie.
+
+    patches: (corner, patch row, patch column) float32, already weighted; corners row by row.
+    counted: (corner row, corner column) float32, their weights; of those of none nothing is added.
+    taper: (patch row, patch column) float32, by which points of a patch count.
+    """
+    total, weights = np.zeros(shape), np.zeros(shape)
+    height, width = counted.shape
+    for row in range(height):
+        for column in range(width):
+            weight = counted[row, column]
+            if weight == 0:
+                continue
+            patch = patches[row * width + column]
+            for r in range(len(taper)):
+                share, own = taper[r], patch[r]
+                into = total[row + r, column : column + len(share)]
+                beside = weights[row + r, column : column + len(share)]
+                for c in range(len(share)):
+                    into[c] += share[c] * own[c]
+                    beside[c] += share[c] * weight
+    return total, weights
 
 
 @_jit

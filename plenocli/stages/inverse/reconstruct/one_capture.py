@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from plenocli.base.budget import on_threads
 from plenocli.base.progress import note
 from plenocli.base.tiling import Plane, bands
 from plenocli.execution.pool import InProcess, Pool
@@ -92,10 +93,12 @@ def reconstruct_capture(
     )
     known = truth_of(recipe, source.count)
     truth = None if known is None else known.cut(*EVERY)
-    matrix, limits = matrix_that_serves(recipe, matrix_of_capture(recipe, source, capture), data)
-    estimators = estimators_by(recipe, matrix)
-    off, cause = error_that_counts(limits), partial(likely_cause, estimators)
-    found, seen = estimate(estimators, method, data, truth, model_error=off, explain=cause)
+    with on_threads(settings.workers):
+        told = matrix_of_capture(recipe, source, capture)
+        matrix, limits = matrix_that_serves(recipe, told, data)
+        estimators = estimators_by(recipe, matrix)
+        off, cause = error_that_counts(limits), partial(likely_cause, estimators)
+        found, seen = estimate(estimators, method, data, truth, model_error=off, explain=cause)
     return _solved(
         found.as_picture(system.object_shape),
         settings,

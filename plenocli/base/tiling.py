@@ -224,9 +224,14 @@ def bands(count: int, most: int) -> list[slice]:
     return [slice(start, min(start + most, count)) for start in range(0, count, most)]
 
 
+def even_bands(count: int, most: int) -> list[slice]:
+    """As few bands as `bands` gives, as long as each other."""
+    return bands(count, -(-count // max(1, -(-count // max(1, most)))))
+
+
 def spread_bands(count: int, most: int, work: Callable[[slice], object]) -> None:
-    """work(rows) for `bands` of 0 to `count`, on as many threads as the budget has."""
-    spread([(rows,) for rows in bands(count, most)], work)
+    """work(rows) for `even_bands` of 0 to `count`, on as many threads as the budget has."""
+    spread([(rows,) for rows in even_bands(count, most)], work)
 
 
 def windows(blocks: Iterable[np.ndarray], wanted: Iterable[slice]) -> Iterator[np.ndarray]:

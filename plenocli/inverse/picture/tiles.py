@@ -13,7 +13,7 @@ from typing import Protocol
 
 import numpy as np
 
-from plenocli.base.tiling import bands, spread_bands
+from plenocli.base.tiling import even_bands, spread_bands
 from plenocli.inverse.picture.estimate import BRIGHTNESS
 from plenocli.inverse.picture.estimators import Estimators
 from plenocli.inverse.picture.lenslet_model import LensletMatrix, Superpixels, Whole
@@ -99,19 +99,14 @@ def tiles_of(estimators: Estimators, method: Method, count: tuple[int, int]) -> 
 
     return [
         Tile((rows, columns), (around(rows, count[0]), around(columns, count[1])))
-        for rows in _even(count[0], side)
-        for columns in _even(count[1], side)
+        for rows in even_bands(count[0], side)
+        for columns in even_bands(count[1], side)
     ]
 
 
 def largest_tile(estimators: Estimators, method: Method) -> int:
     """Lenslets that are looked at for the largest tile that there may be."""
     return (side_of(estimators.system) + 2 * _margin(estimators, method)) ** 2
-
-
-def _even(count: int, most: int) -> list[slice]:
-    """`count` in parts of `most` at most, as long as each other."""
-    return bands(count, -(-count // -(-count // most)))
 
 
 def _margin(estimators: Estimators, method: Method) -> int:

@@ -2,7 +2,7 @@
 estimators that rest on them.
 """
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Hashable
 from pathlib import Path
 from typing import TypeVar
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from plenocli.base.random_streams import stream
 from plenocli.inverse.picture.lenslet_model import Keep, LensletMatrix, work_out
+from plenocli.inverse.picture.nuisances.pixel_model import PixelModel
 from plenocli.inverse.picture.solvers import joint_lmmse, lmmse
 from plenocli.inverse.picture.solvers.least_squares import Svd
 from plenocli.inverse.prior import natural_images
@@ -23,7 +24,10 @@ KEPT = 4
 ReadPictures = Callable[[str | None], list[TrainingPicture]]
 """Gives the training pictures without the scene of this name."""
 
-_Estimator = TypeVar("_Estimator", lmmse.Lmmse, joint_lmmse.JointLmmse, tuple[np.ndarray, ...])
+_Key = TypeVar("_Key", bound=Hashable)
+_Estimator = TypeVar(
+    "_Estimator", lmmse.Lmmse, joint_lmmse.JointLmmse, PixelModel, tuple[np.ndarray, ...]
+)
 
 
 class ScenePrior:
@@ -50,6 +54,7 @@ class ScenePrior:
         self.pictures_of: dict[str | None, list[TrainingPicture]] = {}
         self.statistics: dict[str | None, tuple[np.ndarray, np.ndarray]] = {}
         self._own: dict[tuple[float, str | None], lmmse.Lmmse] = {}
+        self._pixels: dict[tuple[float, float, str | None], PixelModel] = {}
         self._joint: dict[tuple[float, str | None], joint_lmmse.JointLmmse] = {}
         self._heard: dict[tuple[float, str | None], tuple[np.ndarray, ...]] = {}
         self._lags: dict[str | None, tuple[float, np.ndarray]] = {}
@@ -95,6 +100,11 @@ class ScenePrior:
                 keep=self.keep,
             ),
         )
+
+    def pixels(self, sigma: float, scene: str | None, noise: float) -> PixelModel:
+        """What pixels of a superpixel tell of each other, by `lmmse`, at `noise` of a pixel."""
+        own = self.lmmse(sigma, scene)
+        return _kept(self._pixels, (sigma, noise, scene), lambda: PixelModel.of(own, noise))
 
     def _measured(self, pictures: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """Mean and covariance of the pictures' patches of an object's size."""
@@ -159,8 +169,8 @@ class ScenePrior:
 
 
 def _kept(
-    held: dict[tuple[float, str | None], _Estimator],
-    key: tuple[float, str | None],
+    held: dict[_Key, _Estimator],
+    key: _Key,
     make: Callable[[], _Estimator],
 ) -> _Estimator:
     """The estimator of this key, made where it is not held; the oldest makes room."""

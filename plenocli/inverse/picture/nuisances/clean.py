@@ -117,7 +117,7 @@ def clean(
     except PlenoError:  # the method itself will say so, where it needs them
         return bare
     loud = data.common("signal", lambda: root_mean_square(filled.y))
-    model = PixelModel.of(lmmse, max(sigma, LEAST_NOISE * loud))
+    model = estimators.prior.pixels(sigma, data.scene, max(sigma, LEAST_NOISE * loud))
     inner = np.zeros(data.y.shape[:2], bool)
     inner[estimators.inner(data.y.shape[:2])] = True
     task = _Task(
@@ -227,12 +227,15 @@ class _Task:
     def solve(self, y: np.ndarray, guess: np.ndarray) -> _Found:
         """Find and clean.
 
-        y: (lenslet_row, lenslet_column, pixel), finite.
+        y: (lenslet_row, lenslet_column, pixel), finite, 0 in blind lenslets.
         guess: likewise, of which the neighbours' light is reckoned.
         """
         shape, seen = y.shape, ~self.blind
-        stray = guess - self._own_light(guess)
-        own = (y - stray).reshape(-1, shape[2])[seen].T
+        stray = np.broadcast_to(0.0, shape)
+        if self.estimators.coupled:
+            stray = guess - self._own_light(guess)
+        own = (y - stray if self.estimators.coupled else y).reshape(-1, shape[2])
+        own = (own if seen.all() else own[seen]).T
         unknown, clipped = self.unknown[seen].T, self.clipped[seen].T
         sign, clean = find_defects(
             self.model, own, unknown | clipped, self.estimators.system.pixel_shape, self.common
@@ -245,15 +248,11 @@ class _Task:
         if hot.any():
             clean = self.model.impute(own, lost | clipped)
         veil, light = self._veil(clean, clipped.any(axis=0), float(np.mean(np.abs(stray))))
-        bare = replace(self.model, veiled=False)
-        better = own - light
-        if lost.any():
-            better = bare.impute(better, lost)
-        if clipped.any():
-            better = _uncensored(bare, own - light, lost, clipped, self.common)
-        out = y.reshape(-1, shape[2]) - 0.0
-        out[seen] += (better - own).T
-        out[self.blind] = 0.0
+        out, better = y, own
+        if lost.any() or clipped.any() or light.any():
+            better = self._without(own - light, lost, clipped)
+            out = y.copy()
+            out.reshape(-1, shape[2])[seen] += (better - own).T
         counted = self.counted[seen]
         sign, clipped = sign[:, counted], clipped[:, counted]
         findings: list[Finding] = [
@@ -270,7 +269,16 @@ class _Task:
             rise = (better[:, counted] - own + light[counted])[clipped]
             raised = np.mean(rise) / np.mean(np.abs(own[clipped]))
             findings += saturation(clipped.T, declared=self.declared, raised=float(raised))
-        return _Found(out.reshape(shape), tuple(findings))
+        return _Found(out, tuple(findings))
+
+    def _without(self, own: np.ndarray, lost: np.ndarray, clipped: np.ndarray) -> np.ndarray:
+        """Own light (pixel, signal), the veil taken away, with lost and clipped pixels as the
+        others tell them.
+        """
+        bare = replace(self.model, veiled=False)
+        if clipped.any():
+            return _uncensored(bare, own, lost, clipped, self.common)
+        return bare.impute(own, lost)
 
     def _own_light(self, y: np.ndarray) -> np.ndarray:
         """Superpixels y (lenslet_row, lenslet_column, pixel) without the neighbours' light, as

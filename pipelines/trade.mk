@@ -4,10 +4,11 @@ TRADES ?= $(foreach s,trade trade_iterations trade_spectral trade_depth,sample_c
 RUN ?= runs/trade
 SWEEPS = $(TRADES)
 
-page: all
+include $(dir $(lastword $(MAKEFILE_LIST)))sweep.mk
+.DEFAULT_GOAL := page
+
+# sealed once, with the page
+page: $(TABLES)
 	$(P) report $(RUN) --title "What accuracy buys, and what it costs" -o $(RUN)/trade.html --overwrite
 	@$(SEAL)
 .PHONY: page
-
-include $(dir $(lastword $(MAKEFILE_LIST)))sweep.mk
-.DEFAULT_GOAL := page

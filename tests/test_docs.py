@@ -1,8 +1,9 @@
 """Every command line of the README and of docs, run as it stands and in the order of its page, by
 bash in a folder of a new user.
 
-What is run: fenced blocks marked `sh`. The files that the pages name as the reader's own, and the
-cameras of sample_configs, are small ones here.
+What is run: fenced blocks marked `sh`. The files that the pages name as the reader's own, the
+cameras and sweeps of sample_configs, and the number of trials of the longest search, are small
+ones here.
 """
 
 import contextlib
@@ -27,20 +28,63 @@ BLOCKS = {
     page: re.findall(r"^```sh\n(.*?)^```", (ROOT / page).read_text(encoding="utf-8"), re.S | re.M)
     for page in PAGES
 }
-NEEDS = {"lens import": "optiland", "dask ": "distributed", "optimise": "optuna"}
+NEEDS = {
+    "lens import": "optiland",
+    "dask ": "distributed",
+    "optimise": "optuna",
+    "codesign": "optuna",
+}
 """Words of a block -> the module of an extra without which it cannot run."""
 SMALL = {
-    "count = [20, 30]": "count = [12, 18]",
     "[20, 20]": "[12, 12]",
     '"80 um"': '"48 um"',
     '"640 um"': '"384 um"',
     "samples_per_lenslet = [10, 10]": "samples_per_lenslet = [2, 2]",
 }
-SWEEP = {
-    "[5.6, 8, 11, 16]": "[5.6, 8]",
-    "[[9, 9], [11, 11], [13, 13], [15, 15], [17, 17]]": "[[9, 9]]",
-    "steps = 5": "steps = 2",
+SWEEPS = {
+    "lenslets": {
+        "[5.6, 8, 11, 16]": "[5.6, 8]",
+        "[[9, 9], [11, 11], [13, 13], [15, 15], [17, 17]]": "[[9, 9]]",
+        "steps = 5": "steps = 2",
+    },
+    "trade": {
+        "demo_spatial": "tiny",
+        '["ray", "fresnel", "exact"]': '["ray", "fresnel"]',
+        '["block-mean", "tikhonov", "lmmse", "pnp"]': '["block-mean", "lmmse"]',
+        "[1e-1, 1e-2, 1e-3]": "[1e-1]",
+        '["1x1", "3x3"]': '["3x3"]',
+    },
+    "trade_iterations": {
+        "demo_spatial": "tiny",
+        "[1e-1, 1e-2, 1e-3]": "[1e-1]",
+        "[10, 30, 100, 300, 1000]": "[10, 30]",
+    },
+    "trade_spectral": {
+        "demo_spectral": "seed_spectral",
+        '["5 nm", "20 nm", "50 nm"]': '["50 nm"]',
+        '["single-pixel", "pinv", "wls"]': '["single-pixel", "pinv"]',
+        "accuracy = 1e-3": "accuracy = 1e-2",
+        '"10 nm"': '"50 nm"',
+    },
+    **dict.fromkeys(
+        ("codesign", "codesign_optics"), {"[[2, 2], [2, 3], [3, 3], [3, 4], [4, 4]]": "[[2, 2]]"}
+    ),
+    "trade_depth": {"[5, 9, 13, 25, 49]": "[5, 9]", '["500 mm", "550 mm", "620 mm"]': '["500 mm"]'},
 }
+"""Sweeps of sample_configs/sweeps -> what is smaller here."""
+MONOCHROME = {
+    '"311.112 um"': '"309.6 um"',
+    "[16, 16]": "[6, 6]",
+    "[18, 25]": "[12, 14]",
+    '"12.9 um"': '"25.8 um"',
+    "[24, 24]": "[12, 12]",
+}
+"""What is smaller of the camera that docs/photographer.md describes."""
+VOLUME = {
+    "[6, 6]": "[4, 4]",
+    "[object]\n": '[object]\nplanes = "490 mm to 504 mm step 7 mm"\n',
+}
+SHORT = {"--trials 200": "--trials 4"}
 
 
 def rewritten(text, changes):
@@ -101,8 +145,10 @@ def kit(tmp_path_factory):
         ).replace("quantum_efficiency = 0.55\n", ""),
     }.items():
         (folder / "sample_configs" / f"{name}.toml").write_text(text)
-    sweep = folder / "sample_configs" / "sweeps" / "lenslets.toml"
-    sweep.write_text(rewritten(sweep.read_text(), SWEEP))
+    for name, changes in SWEEPS.items():
+        sweep = folder / "sample_configs" / "sweeps" / f"{name}.toml"
+        sweep.write_text(rewritten(sweep.read_text(), changes))
+    shutil.copytree(ROOT / "pipelines", folder / "pipelines")
     (folder / "camera.toml").write_text(spectral)
 
     (folder / "photos").mkdir()
@@ -118,7 +164,8 @@ def kit(tmp_path_factory):
         "white": ["--target", "white"],
         "dark": ["--target", "dark"],
         "captures/chart": ["--target", "colorchecker"],
-        "captures/a": ["--scene", str(folder / "photo.png")],
+        "captures/a": ["--scene", "skimage:camera"],
+        "captures/b": ["--scene", "skimage:coins"],
         **{f"b{nm}": ["--target", f"mono:{nm}nm"] for nm in (450, 540, 570, 650)},
     }
     for seed, (name, what) in enumerate(shots.items()):
@@ -154,7 +201,44 @@ def kit(tmp_path_factory):
     chart.mkdir()
     paint_folder(chart)
     (folder / "triplet.zmx").write_text(ZMX)
-    made = folder / "explore"  # what the other pages made, for the one that goes on from there
+    _made_before(folder, folder / "of_a_page" / "explore")
+    _monochrome_files(folder, folder / "of_a_page" / "photographer")
+    (folder / "runs" / "spatial").mkdir(parents=True)
+    shutil.copy(folder / "of_a_page" / "explore" / "pif.h5", folder / "runs" / "spatial")
+    (folder / "Makefile").write_text(
+        "raw trade:\n\t$(MAKE) -f pipelines/$@.mk RUN=runs/$@\n.PHONY: raw trade\n"
+    )
+    return folder
+
+
+def _monochrome_files(folder, made):
+    """The camera without colours that the page describes, its planes, and PNGs of it."""
+    from PIL import Image
+
+    from plenocli.files.images.mosaic import read_capture
+
+    (made / "captures").mkdir(parents=True)
+    page = (ROOT / "docs" / "photographer.md").read_text(encoding="utf-8")
+    (camera,) = re.findall(r"^```toml\n(.*?)^```", page, re.S | re.M)
+    camera = rewritten(camera, MONOCHROME)
+    (made / "camera.toml").write_text(camera)
+    (made / "planes.toml").write_text(rewritten(camera, VOLUME))
+    shots = {
+        "white": ["--target", "white"],
+        "dark": ["--target", "dark"],
+        "captures/a": ["--scene", str(folder / "photo.png")],
+    }
+    for seed, (name, what) in enumerate(shots.items()):
+        raw = made / f"{name}.dng"
+        line = ["capture-sim", str(made / "camera.toml"), *what, "--model", "fresnel"]
+        line += ["--accuracy", "1e-2", "--superpixels", "1x1", "--seed", str(seed)]
+        assert run([*line, "-o", str(raw)]) == 0
+        Image.fromarray(read_capture(raw).mosaic.astype(np.uint16)).save(made / f"{name}.png")
+        raw.unlink()
+
+
+def _made_before(folder, made):
+    """What the other pages made, for the one that goes on from there."""
     (made / "captures").mkdir(parents=True)
     bands = [
         word for nm in (450, 540, 570, 650) for word in ("--band", f"{nm}nm={folder}/b{nm}.nef")
@@ -196,10 +280,6 @@ def kit(tmp_path_factory):
             )
             == 0
         )
-    (folder / "runs" / "spatial").mkdir(parents=True)
-    shutil.copy(pif, folder / "runs" / "spatial" / "pif.h5")
-    (folder / "Makefile").write_text(f"raw:\n\t$(MAKE) -f {ROOT}/pipelines/raw.mk RUN=runs/raw\n")
-    return folder
 
 
 ZMX = """VERS 140124 258 36214
@@ -268,9 +348,10 @@ def bash(script, folder, timeout):
 @pytest.mark.parametrize("page", [page for page in PAGES if BLOCKS[page]])
 def test_the_page_runs_as_it_stands(kit, tmp_path, page):
     folder = tmp_path / "user"
-    shutil.copytree(kit, folder, ignore=shutil.ignore_patterns("explore"))
-    if page == "docs/explore.md":
-        shutil.copytree(kit / "explore", folder, dirs_exist_ok=True)
+    shutil.copytree(kit, folder, ignore=shutil.ignore_patterns("of_a_page"))
+    own = kit / "of_a_page" / Path(page).stem
+    if own.exists():
+        shutil.copytree(own, folder, dirs_exist_ok=True)
     blocks, left = [], []
     for block in BLOCKS[page]:
         missing = [
@@ -280,6 +361,8 @@ def test_the_page_runs_as_it_stands(kit, tmp_path, page):
         ]
         (left if missing else blocks).append((block, missing))
     script = "".join(block for block, _ in blocks).replace("8786", free_port())
+    for long, short in SHORT.items():
+        script = script.replace(long, short)
     code, log = bash(script, folder, 900)
     assert code == 0, log[-3000:]
     if left:

@@ -280,6 +280,7 @@ def _pictures(folder):
     picture(folder / "labels.png", np.full((6, 7), 99, np.uint8))
     (folder / "photo.exr").write_bytes((folder / "photo.png").read_bytes())
     (folder / "cut.png").write_bytes((folder / "photo.png").read_bytes()[:900])
+    (folder / "words.tif").write_text("light\n")
     (folder / "empty.dng").touch()
     white = (folder / "white.dng").read_bytes()
     (folder / "cut.dng").write_bytes(white[:9000])

@@ -66,6 +66,13 @@ def test_colour_pictures_are_no_mosaics_unless_their_channels_agree(tmp_path):
         read_capture(jpeg)
 
 
+@pytest.mark.parametrize("name,kind", [("a.png", "PNG"), ("a.TIF", "TIFF"), ("a.h5", "HDF5")])
+def test_a_file_that_is_not_what_its_name_says_is_no_raw_file(tmp_path, name, kind):
+    (tmp_path / name).write_text("hello\n")
+    with pytest.raises(InputError, match=f"begins as no {kind} file"):
+        read_capture(tmp_path / name)
+
+
 def test_capture_as_artefact_and_as_exr_says_the_same(tmp_path):
     values = numbers((6, 8), np.uint16)
     capture = Capture(

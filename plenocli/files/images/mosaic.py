@@ -36,6 +36,8 @@ if TYPE_CHECKING:
 CAPTURE = "plenocli:capture"  # EXR attribute: JSON of what a capture artefact has as attributes
 MOSAIC = "capture/mosaic"
 _CFA = re.compile(r"mono|[RGB]{4}")
+NAMED = {".h5": "HDF5", ".png": "PNG", ".tif": "TIFF", ".tiff": "TIFF", ".exr": "OpenEXR"}
+"""Suffix -> what LibRaw need not be asked about."""
 
 
 # --- reading --------------------------------------------------------------------------------------
@@ -73,6 +75,12 @@ def _read(path: Path, cfa: str | None, room: Room | None) -> Capture:
         found = _contained(path, read_lytro(path, room))
     elif path.suffix.lower() in BIO:
         found = _of_values(path, read_bio(path, room), cfa or "mono")
+    elif kind is None and path.suffix.lower() in NAMED:
+        raise InputError(
+            f"begins as no {NAMED[path.suffix.lower()]} file does",
+            path,
+            "make or copy it again; a RAW file keeps its own suffix",
+        )
     else:
         is_dng = kind == "tiff" and path.suffix.lower() == ".dng"
         found = _from_raw(path, "dng" if is_dng else "raw", read_raw(path, room))

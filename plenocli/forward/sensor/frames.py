@@ -7,16 +7,20 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike
 
+from plenocli.base.errors import InputError
 from plenocli.base.tiling import EVERYTHING, Plane
 from plenocli.forward.sensor.noise import Noise
 
 # of the way from black to the white level: averaging electronics saturate softly
 SATURATION = 0.985
 SAME_EXPOSURE = 0.01
+REACH = 1e12
+"""Of white, beyond which sums of squares in single precision overflow sooner or later."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,6 +134,21 @@ def saturated(values: np.ndarray, black: ArrayLike, white: float | None) -> np.n
         return np.zeros(values.shape, bool)
     top = tiled(np.asarray(black) + SATURATION * (white - np.asarray(black)), values.shape)
     return values >= top
+
+
+def require_in_reach(signal: np.ndarray, path: str | Path | None) -> None:
+    """InputError for light that is no sensor's, as of a file in another unit.
+
+    signal: of any shape, 1 for white; NaN where unknown.
+    path: of the capture.
+    """
+    most = max(float(np.fmax.reduce(side, axis=None, initial=0)) for side in (signal, -signal))
+    if most > REACH:
+        raise InputError(
+            f"has pixels of {most:.2g} times the light of white",
+            path,
+            "give it in the unit of its white image, as the sensor counts",
+        )
 
 
 def merge(

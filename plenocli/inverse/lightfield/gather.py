@@ -13,8 +13,10 @@ import numpy as np
 
 from plenocli.base.budget import budget
 from plenocli.base.errors import InputError
+from plenocli.base.text import by
 from plenocli.base.tiling import EVERYTHING, Plane, bands
 from plenocli.forward.sensor.cfa import cfa_map
+from plenocli.forward.sensor.frames import require_in_reach
 from plenocli.inverse.lightfield.samples import (
     AT_ONCE,
     TEMPORARY_BYTES,
@@ -109,6 +111,7 @@ def bands_of(
         first, last = (int(n) for n in np.clip([low - pitch, high + pitch], 0, capture.shape[0]))
         seen, corner = slice(first, max(last, first)), np.array([first, 0])
         signal = sensor.signal.read(seen, EVERYTHING)
+        require_in_reach(signal, capture.metadata.path)
         every = np.ones(len(own), bool)
         parts = (
             collect(signal, white.read(seen, EVERYTHING), own - corner, every, pitch)
@@ -243,7 +246,13 @@ def _along_grid(
 ) -> _Sensor:
     """Along the grid of a calibration, relative to its white image."""
     white, grid = calibration.white, calibration.grid
-    if white is None or white.flat is None or white.flat.shape != shot.shape:
+    if white is not None and white.flat is not None and white.flat.shape != shot.shape:
+        raise InputError(
+            f"is {by(shot.shape)} px, the calibration {by(white.flat.shape)}",
+            shot.metadata.path,
+            "use captures of the calibrated camera",
+        )
+    if white is None or white.flat is None:
         raise InputError(
             "holds no white image of this sensor",
             path,

@@ -47,6 +47,8 @@ def haze(measurement: Measurement) -> np.ndarray:
     # pixels at the pupil's edge count behind no lenslet
     light, seen = _sums(measurement, whole, ever)
     usual = light / np.maximum(seen, 1)
+    if usual.sum() <= 0:  # nothing but dark noise, in which there is no haze
+        return np.zeros(pixels)
     level = np.full(len(whole), np.inf)
     for numbers, signal, usable in _chosen(measurement, whole, ever):
         level[numbers] = signal.sum(axis=1) / np.maximum(usable @ usual, np.finfo(float).tiny)

@@ -16,7 +16,7 @@ from plenocli.base.text import by
 from plenocli.base.tiling import EVERYTHING, Plane, Room, bands, in_cells, in_lenslets
 from plenocli.forward.sensor.capture import SuperpixelGrid
 from plenocli.forward.sensor.cfa import cfa_map
-from plenocli.forward.sensor.frames import saturated
+from plenocli.forward.sensor.frames import require_in_reach, saturated
 from plenocli.forward.sensor.superpixel import extract_rows
 from plenocli.inverse.calibration.calibration import there
 from plenocli.inverse.picture.real_light import (
@@ -72,8 +72,8 @@ def measured(
         a grey capture has none.
     room: for them, of a shape, which takes slices of rows.
 
-    Raises InputError where sizes disagree or lenslets are missing, UsageError for a channel that
-    the capture does not have, or none of those that it has.
+    Raises InputError where sizes disagree, lenslets are missing or light is out of reach,
+    UsageError for a channel that the capture does not have, or none of those that it has.
     """
     channel = _asked(capture, channel)
     several = stack.lenslets
@@ -92,6 +92,7 @@ def measured(
         cut = found.cut(slice(first, min(last, rows)))
         # what the last row of cells lacks
         cut = np.pad(cut, ((0, last - first - len(cut)), (0, 0), (0, 0)), constant_values=np.nan)
+        require_in_reach(cut, capture.metadata.path)
         signal[cells, :] = in_cells(cut, several)
     return Measurement(
         signal=signal, read_variance=found.read_variance, gain=found.gain, background=background

@@ -5,6 +5,7 @@ and against spectra whose bands are views.
 import numpy as np
 import pytest
 
+from plenocli.base.errors import InputError
 from plenocli.forward.sensor.capture import Capture, SuperpixelGrid
 from plenocli.forward.sensor.cfa import ColourProfile, cfa_map, colour_planes, preview
 from plenocli.inverse.calibration.calibration import Calibration, Response, Sensor, White, Windows
@@ -171,3 +172,12 @@ def test_a_mosaic_without_a_calibration_is_refused_or_grey_on_the_whole():
     assert np.allclose(samples.channels.weights.sum(), 1)
     counts = [some.sum() for some in samples.parts()]
     assert counts[1] > 1.9 * counts[0] and min(counts) > 0
+
+
+def test_captures_of_another_sensor_or_of_another_unit_are_refused():
+    white = np.ones((COUNT * 11, COUNT * 11))
+    with pytest.raises(InputError, match="is 20 x 30 px, the calibration 275 x 275"):
+        bands_of(Capture(mosaic=np.ones((20, 30))), known_camera(11, "mono", white))
+    for far in (1e25, -1e25):
+        with pytest.raises(InputError, match="times the light of white"):
+            chain(far * white, 11, "mono", white, np.array([0.0]))

@@ -84,3 +84,9 @@ def test_haze_in_bands_is_that_of_one_sort_of_all_lenslets(monkeypatch):
 
 def test_too_few_lenslets_have_no_haze():
     assert not haze(Measurement(signal=np.ones((3, 3, 4)), read_variance=0.0)).any()
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_capture_below_the_dark_level_has_no_haze():
+    noise = np.random.default_rng(4).normal(-1.0, 0.1, (8, 8, 4)).astype(np.float32)
+    assert not haze(Measurement(signal=noise, read_variance=1e-2)).any()

@@ -104,6 +104,15 @@ def test_a_colours_pixels_alone_tell_its_light_in_units_of_white(in_colour, lett
     assert np.ptp(level) < 0.02 * level[0]
 
 
+def test_light_that_no_sensor_reports_is_refused_before_its_squares_overflow(in_colour):
+    shot, stack, known, _ = in_colour
+    bright = measured(replace(shot, cfa="mono", mosaic=1e6 * shot.mosaic), stack, known)
+    assert np.isfinite(bright.signal).any()
+    for factor in (1e20, -1e20):
+        with pytest.raises(InputError, match="times the light of white"):
+            measured(replace(shot, cfa="mono", mosaic=factor * shot.mosaic), stack, known)
+
+
 def test_channels_that_a_sensor_does_not_have_are_refused(in_colour):
     shot, stack, known, _ = in_colour
     with pytest.raises(UsageError, match="B, G, R"):

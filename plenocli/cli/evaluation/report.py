@@ -49,5 +49,6 @@ def command(
     options.summary(
         made.as_json(),
         as_json,
-        f"{output}: {', '.join(made.sections) or 'no pictures'}; {made.files} files{missing}",
+        f"{output}: {', '.join(made.sections) or 'no pictures'}; "
+        f"{made.files} file{'s' * (made.files != 1)}{missing}",
     )

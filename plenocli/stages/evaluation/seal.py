@@ -37,7 +37,7 @@ class Sealed:
         if self.changes is None:
             told = "what was changed in it is not known; --was ORIGINAL tells"
             if self.path.is_dir():
-                return f"{self.path}: {self.files} files sealed"
+                return f"{self.path}: {self.files} file{'s' * (self.files != 1)} sealed"
         elif not self.changes:
             told = "nothing has changed"
         else:

@@ -73,7 +73,10 @@ class VolumeSummary(Record):
                 else "; it is not tied to the other volume: its structure is another, or held-out "
                 "pixels object"
             )
-        return f"{text}; {self.margin} lenslets along the border miss light"
+        some = "1 lenslet along the border misses light"
+        if self.margin != 1:
+            some = f"{self.margin} lenslets along the border miss light"
+        return f"{text}; {some}"
 
 
 def run_volume(

@@ -96,6 +96,18 @@ def test_only_the_metrics_asked_for(picture):
     assert not (folder / "t.json").exists()
 
 
+@pytest.mark.parametrize(
+    "option", [{"classes": "no-table"}, {"detect": "rust"}, {"learnt": True}, {"prior": "paints"}]
+)
+def test_what_means_nothing_to_any_result_is_refused(picture, option):
+    """It would stand among the inputs of figures that it has no part in."""
+    folder, capture, good, *_ = picture
+    (name,) = option
+    with pytest.raises(UsageError, match=f"--{name}: means nothing to a result that is image"):
+        run_score([good], folder / "t.json", truth=capture, **option)
+    assert not (folder / "t.json").exists()
+
+
 def test_one_bad_result_does_not_stop_the_others(picture, capfd, monkeypatch):
     folder, capture, good, *_ = picture
     (folder / "torn.h5").write_bytes((folder / "poor.h5").read_bytes()[:-100])

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from plenocli.base.errors import InputError, PlenoError
+from plenocli.base.errors import InputError, PlenoError, UsageError
 from plenocli.base.progress import tell
 from plenocli.base.tiling import Plane
 from plenocli.evaluation.chosen import definitions_of, keep_chosen
@@ -36,6 +36,16 @@ from plenocli.stages.evaluation.score.comparison import Comparison, Scored
 from plenocli.stages.evaluation.score.depth import score_planes, score_volume
 from plenocli.stages.evaluation.score.designs import score_calibration, score_dictionary
 from plenocli.stages.evaluation.score.pictures import score_image
+
+
+SERVES = {
+    "classes": ("spectra", "calibration"),
+    "detect": ("spectra", "calibration"),
+    "learnt": ("spectra", "calibration"),
+    "prior": ("calibration",),
+    "white": ("spectra",),
+}
+"""Options -> kinds of results to which they mean something."""
 
 
 def run_score(
@@ -104,6 +114,8 @@ def run_score(
         comparison, classes=classes, detect=detect, method=method, prior=prior, learnt=learnt
     )
     scored = _score_all(results, comparison, tuple(metrics))
+    given = {"classes": classes, "detect": detect, "learnt": learnt, "prior": prior}
+    _require_use([name for name, value in (given | {"white": whites}).items() if value], scored)
     errors = [(path, one.failed) for path, one in zip(results, scored) if one.failed is not None]
     if len(errors) == len(results):
         raise failed_together(
@@ -131,6 +143,21 @@ def run_score(
             errors, len(results), "results", output, "the others are scored; see the messages above"
         )
     return document
+
+
+def _require_use(given: Sequence[str], scored: Sequence[Scored]) -> None:
+    """UsageError for an option that means nothing to any result.
+
+    given: names of those of SERVES that were given.
+    """
+    kinds = {one.score.kind for one in scored if one.failed is None}
+    for name in given:
+        if kinds and not kinds & set(SERVES[name]):
+            raise UsageError(
+                f"means nothing to a result that is {' or '.join(sorted(map(str, kinds)))}",
+                f"--{name}",
+                f"leave it out, or score {' or '.join(SERVES[name])}",
+            )
 
 
 def _is_file(name: Path | str | None) -> bool:

@@ -37,7 +37,6 @@ from plenocli.stages.evaluation.score.depth import score_planes, score_volume
 from plenocli.stages.evaluation.score.designs import score_calibration, score_dictionary
 from plenocli.stages.evaluation.score.pictures import score_image
 
-
 SERVES = {
     "classes": ("spectra", "calibration"),
     "detect": ("spectra", "calibration"),

@@ -190,6 +190,35 @@ def spread(parts: Sequence[tuple], work: Callable[..., object]) -> None:
                 done.result()
 
 
+def spread_in_turn(
+    groups: Sequence[tuple[Sequence[tuple], Callable[[], object]]], work: Callable[..., object]
+) -> None:
+    """For each group (parts, end) work(*part) for all parts, and then end(), on as many threads as
+    the budget has: who finds no part left in a group goes on with the next one while it ends. No
+    more groups are worked on at a time than there are threads.
+    """
+    if budget().threads <= 1:
+        for parts, end in groups:
+            spread(parts, work)
+            spread([()], end)
+        return
+    from concurrent.futures import ThreadPoolExecutor, wait
+
+    def end_after(coming: list[Future], end: Callable[[], object]) -> None:
+        wait(coming)  # all of them are begun: threads take them in order
+        for part in coming:
+            part.result()
+        end()
+
+    with one_thread(), ThreadPoolExecutor(budget().threads) as pool:
+        ends = []
+        for parts, end in groups:
+            coming = [pool.submit(copy_context().run, work, *part) for part in parts]
+            ends.append(pool.submit(copy_context().run, end_after, coming, end))
+        for done in ends:
+            done.result()
+
+
 def both(one: Callable[[], T], other: Callable[[], U]) -> tuple[T, U]:
     """What two functions give, at the same time where the budget has threads."""
     found: dict[int, Any] = {}

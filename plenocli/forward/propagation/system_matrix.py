@@ -422,9 +422,9 @@ class _OneSuperpixel:
         self._columns = (ox + 1) // 2 if self._mirror_x else ox
         self._share = np.empty((oy, ox))
         self._energies = builder.lenslets.on_superpixel(sy, sx)
-        # a cache line of points at a time; where columns differ in length, fewer,
-        # for threads to share, the longest first
-        step = 8 if self._turn else 16
+        # a cache line of points at a time; where columns differ in length, or are few, fewer, for
+        # threads to share, the longest first
+        step = min(8 if self._turn else 16, -(-self._columns // 4))
         self.parts = [
             (start, min(start + step, self._columns)) for start in range(0, self._columns, step)
         ][::-1]

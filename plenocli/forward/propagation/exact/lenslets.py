@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from plenocli.base.budget import on_threads, spread
+from plenocli.base.budget import on_threads, spread, spread_in_turn
 from plenocli.base.device import device
 from plenocli.forward.camera.quadrature import gauss, nodes_for
 from plenocli.forward.propagation.exact.debye import spherical_field
@@ -246,11 +246,14 @@ class ExactSquareLenslets(LensletFields):
 
         with on_threads(plan.at_once):
             self._meet_all(largest_first)
-            for start in range(0, len(largest_first), plan.at_once):
-                some = [self._lit(*at) for at in largest_first[start : start + plan.at_once]]
-                # the brightest lenslets take longest
-                spread([(lit, key) for lit in some for key in reversed(lit.kept)], self._follow)
-                spread([(lit,) for lit in some], join)
+            # the brightest lenslets take longest
+            spread_in_turn(
+                [
+                    ([(lit, key) for key in reversed(lit.kept)], partial(join, lit))
+                    for lit in (self._lit(*at) for at in largest_first)
+                ],
+                self._follow,
+            )
         self._intervals = {}
         self.notes = FieldNotes(
             separable_terms=max(t.high.shape[3] for t in self._tables.values()),

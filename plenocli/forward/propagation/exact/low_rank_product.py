@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from copy import copy
 from threading import local
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -130,6 +131,16 @@ class Product:
         p, triangle = _triangle(seen)
         return p, triangle.T
 
+    def _values(self, q: Any, seen: Any) -> tuple[Any, Any, Any, Any]:
+        """(U, s, V, P): Q Q^H M = Q U diag(s) (P V)^T, P = Q where M is symmetric, else `seen`."""
+        if self.symmetric:
+            u, s, vh = self.device.xp.linalg.svd(self._core(q, seen)[1], full_matrices=False)
+            return u, s, vh.T, q
+        # what is seen times conj(U) is as long as s
+        u, s, _ = self.device.xp.linalg.svd(_only_triangle(seen).T, full_matrices=False)
+        least = self.device.xp.finfo(s.dtype).tiny
+        return u, s, self.device.xp.conj(u) / (s + least), seen
+
     def factors(
         self, cut: float, count: int, worst: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
@@ -143,14 +154,17 @@ class Product:
         Returns (H, B).
         Raises NumericsError where no sketch of MAX_SKETCH columns holds M.
         """
+        if not self.symmetric and self.left.shape[0] > self.right.shape[0]:
+            # the basis is made where it is shorter, and gone through once less
+            turned = self._turned().factors(cut, count, None if worst is None else worst.T)
+            return turned[1], turned[0]
         most, xp, home = min(self.limit, MAX_SKETCH), self.device.xp, self.device.get
         size, q, seen = min(count, most), None, None
         while True:
             q, seen = self._extend(q, seen, size)
-            p, core = self._core(q, seen)
-            u, s, vh = xp.linalg.svd(core, full_matrices=False)
+            u, s, v, p = self._values(q, seen)
             root, terms = xp.sqrt(s), terms_within(home(s), cut)
-            u, v = u * root, vh.T * root
+            u, v = u * root, v * root
             if worst is not None:
                 high, wide = home(_product(q, u)), home(_product(p, v))
                 terms = max(terms, _terms_of_all(high, wide, worst))
@@ -164,6 +178,14 @@ class Product:
             if size >= MAX_SKETCH:
                 raise _too_many(size)
             size = min(most, max(size + size // 4, int(terms / FILL) + 8))
+
+    def _turned(self) -> Product:
+        """The product's transpose."""
+        turned = copy(self)
+        turned.left, turned.right = self.right, self.left
+        turned._places = self._places[::-1]
+        turned.couplings = {(b, a): k.T for (a, b), k in self.couplings.items()}
+        return turned
 
     def spanned(self, cut: float, count: int) -> tuple[np.ndarray, np.ndarray]:
         """The product through random combinations of its columns alone, M = H B^T with H
@@ -378,3 +400,13 @@ def _triangle(columns: Any) -> tuple[Any, Any]:
     from scipy.linalg import qr
 
     return qr(columns, mode="economic", check_finite=False)
+
+
+def _only_triangle(columns: Any) -> Any:
+    """R of `_triangle`."""
+    if not isinstance(columns, np.ndarray):
+        return namespace(columns).linalg.qr(columns)[1]
+    from scipy.linalg import qr
+
+    (found,) = qr(columns, mode="r", check_finite=False)
+    return found[: columns.shape[1]]

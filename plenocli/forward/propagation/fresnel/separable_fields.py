@@ -55,7 +55,7 @@ class Factors:
         quadrature weights (m) are folded in, so that |U|^2 summed over the nodes of a pixel is the
         share of the light that it receives.
     pixel_shape: (rows, columns);
-    pixel_nodes: nodes per axis;
+    pixel_nodes: nodes of a pixel, along either axis or (rows, columns);
     signs: (terms,) of +-1 that multiply the terms, so that one table may serve as both;
     shown: real (nodes x pixel rows, lines) and (nodes x pixel columns, lines) that bring fields to
         the nodes, where the tables have lines in their place; None: they have the nodes;
@@ -67,12 +67,13 @@ class Factors:
         high: np.ndarray,
         wide: np.ndarray,
         pixel_shape: tuple[int, int],
-        pixel_nodes: int,
+        pixel_nodes: int | tuple[int, int],
         signs: np.ndarray | None = None,
         shown: tuple[np.ndarray, np.ndarray] | None = None,
         device: Device = CPU,
     ) -> None:
-        nodes = [pixel_nodes * pixels for pixels in pixel_shape]
+        per_pixel = (pixel_nodes,) * 2 if isinstance(pixel_nodes, int) else pixel_nodes
+        nodes = [n * pixels for n, pixels in zip(per_pixel, pixel_shape)]
         lines = [high.shape[2], wide.shape[2]]
         whole = [x.shape for x in shown] == [*zip(nodes, lines)] if shown else lines == nodes
         if not whole or high.shape[3] != wide.shape[3]:
@@ -84,7 +85,7 @@ class Factors:
             np.ascontiguousarray(high),
             np.ascontiguousarray(wide, dtype=high.dtype),
         )
-        self.pixel_shape, self.pixel_nodes = (pixel_shape[0], pixel_shape[1]), pixel_nodes
+        self.pixel_shape, self.pixel_nodes = (pixel_shape[0], pixel_shape[1]), per_pixel
         self.signs = None if signs is None else signs.astype(high.real.dtype)
         self.shown = shown and (_as(high, shown[0]), _as(high, shown[1].T))
         self.device = device
@@ -92,11 +93,9 @@ class Factors:
     @cached_property
     def turned(self) -> Factors:
         """Rows and columns exchanged, of tables without signs."""
-        shape = self.pixel_shape[1], self.pixel_shape[0]
+        shape, nodes = self.pixel_shape[::-1], self.pixel_nodes[::-1]
         shown = self.shown and (self.shown[1].T, self.shown[0])
-        return Factors(
-            self.wide, self.high, shape, self.pixel_nodes, shown=shown, device=self.device
-        )
+        return Factors(self.wide, self.high, shape, nodes, shown=shown, device=self.device)
 
     @cached_property
     def _there(self) -> tuple[Any, Any]:
@@ -121,7 +120,7 @@ class Factors:
                 out[group] = self._elsewhere(sy, sx, rows[group], columns[group[0]])
             return
         real, lines, width = self.high.real.dtype, self.high.shape[2], self.wide.shape[2]
-        (py, px), nodes = self.pixel_shape, self.pixel_nodes
+        (py, px), nodes = self.pixel_shape, self.pixel_nodes[0]
         step = max(1, round(WORK_BYTES / (lines * 2 * width * real.itemsize)))
         work = np.empty((3 if self._thirds else 2) * step * lines * width, real)
         for group in groups:
@@ -142,16 +141,14 @@ class Factors:
     def _elsewhere(self, sy: int, sx: int, rows: np.ndarray, column: int) -> np.ndarray:
         """(point, pixel row, pixel column) of points of one column, by the device."""
         xp, put = self.device.xp, self.device.put
-        (py, px), nodes, (high, wide) = self.pixel_shape, self.pixel_nodes, self._there
+        (py, px), (ny, nx), (high, wide) = self.pixel_shape, self.pixel_nodes, self._there
         left = xp.take(high[sy, :, :, :], put(rows), axis=0)
         field = left @ wide[sx, int(column), :, :].T
         if self.shown:
             y, x = (xp.astype(put(n), field.dtype) for n in self.shown)
             field = y @ (field @ x)
         energy = xp.abs(field) ** 2
-        return self.device.get(
-            xp.sum(xp.reshape(energy, (len(rows), nodes, py, nodes, px)), axis=(1, 3))
-        )
+        return self.device.get(xp.sum(xp.reshape(energy, (len(rows), ny, py, nx, px)), axis=(1, 3)))
 
     def _shown(self, product: np.ndarray) -> np.ndarray:
         """(points x lines, parts x lines) on the nodes."""
@@ -195,6 +192,57 @@ class Factors:
         right[:, 0, 1] = turned.imag
         np.negative(turned.imag, out=right[:, 1, 0])
         return (right.reshape(2 * len(turned), -1),)
+
+
+def pixel_modes(
+    high: np.ndarray, wide: np.ndarray, pixels: int, light: np.ndarray, most: float
+) -> np.ndarray:
+    """Orthonormal functions on the nodes of each pixel along one axis, the dimmest first, that
+    carry nearly all of the light there. Nodes resolve how fringes of all lenslets are summed up;
+    the field itself has fewer numbers a pixel, and what is perpendicular to them only adds to the
+    light by its own.
+
+    high, wide: tables of this axis and of the other, (point, nodes x pixels, term);
+    pixels: along this axis;
+    light: of points, (point of this axis, of the other);
+    most: that a point's pixels may lose together (root sum of squares, as summed along the other
+        axis), over what they have at the least.
+
+    Returns (pixel, node, function).
+    """
+    points, _, terms = high.shape
+    bright = np.stack([np.einsum("nt,nt->t", w.real, w.real) for w in wide])
+    bright += np.stack([np.einsum("nt,nt->t", w.imag, w.imag) for w in wide])
+    nodes = _by_pixel(high, pixels)
+    weighted = nodes.reshape(pixels, -1, points, terms) * np.sqrt(bright.mean(axis=0))
+    weighted = weighted.reshape(nodes.shape)
+    _, vectors = np.linalg.eigh((weighted @ weighted.conj().transpose(0, 2, 1)).astype(complex))
+    lost, last = np.zeros((pixels, *light.shape)), vectors.shape[2] - 1
+    for drop in range(last):
+        seen = vectors[:, None, :, drop].conj().astype(high.dtype) @ nodes
+        power = (np.square(seen.real) + np.square(seen.imag)).reshape(pixels, points, terms)
+        lost += power @ bright.T
+        if (np.sqrt(pixels * np.square(lost).sum(axis=0)) > most * light).any():
+            return vectors[:, :, drop:]
+    return vectors[:, :, last:]
+
+
+def on_modes(table: np.ndarray, modes: np.ndarray) -> np.ndarray:
+    """A table (point, nodes x pixels, term) on functions of each pixel, (pixel, node, function), in
+    place of its nodes.
+    """
+    points, _, terms = table.shape
+    pixels, _, count = modes.shape
+    adjoint = modes.conj().transpose(0, 2, 1).astype(table.dtype)
+    shown = (adjoint @ _by_pixel(table, pixels)).reshape(pixels, count, points, terms)
+    return np.ascontiguousarray(shown.transpose(2, 1, 0, 3)).reshape(points, -1, terms)
+
+
+def _by_pixel(table: np.ndarray, pixels: int) -> np.ndarray:
+    """A table (point, nodes x pixels, term) as (pixel, node, point x term)."""
+    points, _, terms = table.shape
+    parts = table.reshape(points, -1, pixels, terms).transpose(2, 1, 0, 3)
+    return parts.reshape(pixels, -1, points * terms)
 
 
 def _as(table: np.ndarray, matrix: np.ndarray) -> np.ndarray:

@@ -25,6 +25,7 @@ from plenocli.forward.propagation.exact.oblique import at_points, oblique_field
 from plenocli.forward.propagation.exact.open_fields import too_near
 from plenocli.forward.propagation.exact.prolate import prolate, prolate_count
 from plenocli.forward.propagation.exact.term_counts import (
+    MARGIN_JOINED,
     ExactBand,
     field_rank,
     field_terms,
@@ -471,7 +472,11 @@ class ExactSquareLenslets(LensletFields):
         cut = self.band.cut * mean**CONCENTRATION
         kept = self._bright(sy, sx, cut / 4)
         all_points = math.sqrt(len(self._points(sy, 0)) * len(self._points(sx, 1)))
-        guess = int(sketch_size(self._expected_rank(sy, sx), joined=len(kept) > 1))
+        guess = (
+            sketch_size(self._expected_rank(0, 0), MARGIN_JOINED[(sy != 0) + (sx != 0)])
+            if len(kept) > 1
+            else sketch_size(self._expected_rank(sy, sx))
+        )
         return _Lit(
             at=(sy, sx),
             symmetric=self._turn and sy == sx,
@@ -479,7 +484,7 @@ class ExactSquareLenslets(LensletFields):
             cut=cut / (6 if len(kept) > 1 and self._fine else 2),
             narrowing=self.band.cut * mean**EVENLY / 2 * all_points,
             whole=self.band.cut * all_points,
-            guess=guess,
+            guess=int(guess),
             spanned=len(kept) == 1 and is_spanned(guess),
         )
 

@@ -4,6 +4,7 @@ split into shards.
 
 from __future__ import annotations
 
+import importlib
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from plenocli.base.budget import budget
+from plenocli.base.budget import ahead, budget, one_thread
 from plenocli.base.errors import NumericsError
 from plenocli.forward.propagation import diagnosis
 
@@ -54,7 +55,7 @@ def cost(plan: PifPlan) -> tuple[bool, int]:
     streamed = plan.bytes > min(WHOLE_BYTES, budget().memory // 4)
     diagnosed = diagnosis.memory(plan.shape)
     if streamed:  # piece by piece, while the fields are there
-        return streamed, 5 * slab + work + diagnosed
+        return streamed, 7 * slab + work + diagnosed
     return streamed, plan.bytes + max(work, diagnosed)
 
 
@@ -120,10 +121,16 @@ def stream_pif(
     from plenocli.forward.propagation.system_matrix import described, pif_pieces
 
     diagnosis, tails, last = None, {}, None
-    with writing_pif(
-        output, plan.shape, np.dtype(plan.dtype), groups=chosen.groups, overwrite=overwrite
-    ) as writer:
-        for builder, band, superpixel, slab in pif_pieces(camera, plan, progress=progress):
+    # what a piece is diagnosed with can be told to stay on one thread only once it is loaded
+    importlib.import_module("scipy.linalg")
+    with (
+        one_thread(),
+        writing_pif(
+            output, plan.shape, np.dtype(plan.dtype), groups=chosen.groups, overwrite=overwrite
+        ) as writer,
+    ):
+        pieces = ahead(pif_pieces(camera, plan, progress=progress))
+        for builder, band, superpixel, slab in pieces:
             diagnosis = diagnosis or PiecewiseDiagnosis(
                 len(plan.bands),
                 builder.offsets,

@@ -11,6 +11,7 @@ from __future__ import annotations
 import importlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from itertools import cycle
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -282,7 +283,8 @@ class PifBuilder:
     def pieces(self) -> Iterator[tuple[int, np.ndarray]]:
         """The matrix superpixel by superpixel, in the order of `orbits`.
 
-        Yields (superpixel, A of it (pixel, point)), a work array that the next one overwrites.
+        Yields (superpixel, A of it (pixel, point)), a work array that the one after the next
+        overwrites.
         Models that compute all superpixels of a point at once hold the whole matrix meanwhile.
         Raises as `columns`.
         """
@@ -291,9 +293,11 @@ class PifBuilder:
             self.fill(whole)
             yield from enumerate(whole)
             return
-        slab, other = np.empty((2, self.shape[1], self.points), self.dtype)
+        slabs, others = (
+            cycle(np.empty((2, self.shape[1], self.points), self.dtype)) for _ in range(2)
+        )
         total = np.zeros(self.object_shape)
-        for first, members in self.orbits():
+        for slab, (first, members) in zip(slabs, self.orbits()):
             one = _OneSuperpixel(self, first, slab)
             spread(one.parts, one.compute)
             share = one.complete()
@@ -302,6 +306,7 @@ class PifBuilder:
                 if how == (False, False, False):
                     yield index, slab
                 else:
+                    other = next(others)
                     np.copyto(self.planes(other), turned_planes(self.planes(slab), how))
                     yield index, other
         self.require_all_light(total)
@@ -512,7 +517,8 @@ def pif_pieces(
 ) -> Iterator[tuple[PifBuilder, int, int, np.ndarray]]:
     """The system matrix in pieces, for one too large to hold; arguments as build_pif.
 
-    Yields (builder, band, superpixel, A of it (pixel, point)); the next piece overwrites the array.
+    Yields (builder, band, superpixel, A of it (pixel, point)); the piece after the next overwrites
+    the array.
     See PifBuilder.pieces and `described`. Raises as build_pif.
     """
     count = _ColumnCount(plan, progress)

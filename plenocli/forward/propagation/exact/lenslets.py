@@ -241,7 +241,8 @@ class ExactSquareLenslets(LensletFields):
         self.symmetry = flip_rows, flip_columns, turn
         alike = g.pixel_shape[0] == g.pixel_shape[1] and g.object_shape[0] == g.object_shape[1]
         self._turn = alike and turn
-        self._entering, self._counted = self._light()
+        with on_threads(plan.at_once):
+            self._entering, self._counted = self._light()
         self._extent, self._bandwidth = (
             [_extent(geometry, n) for n in geometry.pixel_shape],
             _bandwidth(geometry),
@@ -406,12 +407,16 @@ class ExactSquareLenslets(LensletFields):
         g, points = self.geometry, self._points(0, axis)
         half = g.lenslet_width / 2
         t, w = gauss(psf_nodes(g, half))
-        grams = []
-        for m in lit_lenslets(self._reach(axis), self.band.window):
+        lenslets = lit_lenslets(self._reach(axis), self.band.window)
+        grams: dict[int, np.ndarray] = {}
+
+        def meet(m: int) -> None:
             values = self._field.evaluate(half * t + m * g.D2 - points[:, None], axis)
             values = at_points(self._field, values, points[:, None]).transpose(0, 2, 1)
-            grams.append((values * (half * w)) @ values.conj().transpose(0, 2, 1))
-        gram = np.array(grams)
+            grams[m] = (values * (half * w)) @ values.conj().transpose(0, 2, 1)
+
+        spread([(m,) for m in lenslets], meet)
+        gram = np.array([grams[m] for m in lenslets])
         mirrored = gram[::-1, : len(g.points(axis)) - len(points)][:, ::-1]
         return np.concatenate([gram, mirrored], axis=1)
 

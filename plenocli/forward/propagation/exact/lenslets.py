@@ -25,7 +25,8 @@ from plenocli.forward.propagation.exact.oblique import at_points, oblique_field
 from plenocli.forward.propagation.exact.open_fields import too_near
 from plenocli.forward.propagation.exact.prolate import prolate, prolate_count
 from plenocli.forward.propagation.exact.term_counts import (
-    MARGIN_JOINED,
+    MARGIN_ASIDE,
+    MARGINS_JOINED,
     ExactBand,
     field_rank,
     field_terms,
@@ -85,15 +86,15 @@ lenslets of a fill of 0.6 lost up to 1.4 times what was asked with twice as many
 f/2.5.)
 """
 
-FINE = 5e-5
+FINE = 8e-5
 """Accuracy from which on each of many lenslets loses a third as much: corners of steep ones lost
-1.8 times what was asked at 1e-5 (f/1.5), 0.9 at 1e-4.
+1.8 times what was asked at 1e-5, 1.1 at 6e-5 and 0.9 at 1e-4 (f/1.5).
 """
 
-PIXEL_LOSS = 0.3
-"""Cuts that a point's pixels on a superpixel may lose where fewer numbers than nodes carry them
-(f/4.4 at 1e-4: columns changed by 2.2e-5 at the most, 5e-6 in the mean). From FINE on a third of
-it: with all of it corners at f/1.5 and 1e-5 were 1.07 of what was asked, 0.89 so, 0.86 without.
+PIXEL_LOSS = 0.2
+"""Cuts that a point's pixels on a superpixel may lose where fewer numbers than nodes carry them:
+of what was asked, 0.08 an axis and superpixel. From FINE on a third of it. (Corners at f/1.5 were
+0.27 of what was asked worse with half as much again at 1e-3, and 0.2 at 1e-5 without the third.)
 """
 
 LEAST = 1e-10
@@ -478,11 +479,11 @@ class ExactSquareLenslets(LensletFields):
         cut = self.band.cut * mean**CONCENTRATION
         kept = self._bright(sy, sx, cut / 4)
         all_points = math.sqrt(len(self._points(sy, 0)) * len(self._points(sx, 1)))
-        guess = (
-            sketch_size(self._expected_rank(0, 0), MARGIN_JOINED[(sy != 0) + (sx != 0)])
-            if len(kept) > 1
-            else sketch_size(self._expected_rank(sy, sx))
-        )
+        own, here = self._expected_rank(0, 0), self._expected_rank(sy, sx)
+        guess = sketch_size(here)
+        if len(kept) > 1:
+            margin, least = MARGINS_JOINED[(sy != 0) + (sx != 0)], MARGIN_ASIDE
+            guess = max(sketch_size(own, margin), sketch_size(here, least))
         return _Lit(
             at=(sy, sx),
             symmetric=self._turn and sy == sx,

@@ -22,12 +22,14 @@ if TYPE_CHECKING:
 
 MANY_CELLS, EDGE_CELLS = 100.0, 50.0
 """Diffraction cells of a lenslet that the effects of fine cuts and of edges are stated for."""
-MARGIN, MARGIN_JOINED = 1.12, (1.2, 1.18, 0.9)
-"""How many more terms than expected the first sketch of a field holds: of an isolated lenslet's,
-and of many lenslets', over what is expected on the own superpixel, by the number of axes along
-which it lies beside it (0.76 to 1.02, 0.82 to 1.16 and 0.7 to 0.88 of it were found with three
-cameras from 1e-2 to 1e-4, where on the own superpixel, of which all points count, a sketch misses
-more; one that is too small costs more than one that is too large).
+MARGIN = 1.12
+"""How many more terms than expected the first sketch of an isolated lenslet's field holds."""
+MARGINS_JOINED, MARGIN_ASIDE = (1.2, 1.18, 0.9), 0.78
+"""Of many lenslets': of what is expected on the own superpixel, by the number of axes along which
+it lies beside it (0.76 to 1.02, 0.82 to 1.16 and 0.7 to 0.88 of it were found with three cameras
+from 1e-2 to 1e-4); and of what is expected on the superpixel itself at the least: what a sketch
+misses of dim points is told by nothing else. One that is too small costs more than one that is too
+large.
 """
 MANY = 200
 """Columns of a first sketch beyond which singular vectors cost more than the terms that they save.
@@ -110,7 +112,7 @@ def term_law() -> TermLaw:
 def sketch_size(terms: float, margin: float = MARGIN) -> float:
     """Columns of the random sketch that is begun with where so many terms are expected.
 
-    margin: MARGIN, or one of MARGIN_JOINED.
+    margin: MARGIN, MARGIN_ASIDE or one of MARGINS_JOINED.
     """
     return margin / FILL * terms + 8
 

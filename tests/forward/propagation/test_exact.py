@@ -12,6 +12,7 @@ from plenocli.base.budget import budget, within
 from plenocli.base.errors import NumericsError
 from plenocli.forward.accuracy import dial as accuracy
 from plenocli.forward.camera.geometry import geometry
+from plenocli.forward.camera.quadrature import gauss
 from plenocli.forward.propagation.bands import spectral_nodes
 from plenocli.forward.propagation.exact import lenslets as exact
 from plenocli.forward.propagation.exact import low_rank_product as product
@@ -19,7 +20,7 @@ from plenocli.forward.propagation.exact import term_counts
 from plenocli.forward.propagation.exact.residual import Residual, ell, kappa, path, split
 from plenocli.forward.propagation.fresnel import separable_fields
 from plenocli.forward.propagation.fresnel.paraxial_error import paraxial_error
-from plenocli.forward.propagation.fresnel.separable_fields import Factors
+from plenocli.forward.propagation.fresnel.separable_fields import Factors, on_modes, pixel_modes
 from plenocli.forward.propagation.system_matrix import PifBuilder
 from tests.forward.propagation.cameras import WAVELENGTH, small_camera
 from tests.reference.fresnel import sensor_nodes
@@ -865,8 +866,37 @@ def test_grids_that_are_no_squares_hold_parts_of_a_fine_one(nearer):
         assert (missed <= 1e-3 * np.sqrt((part**2).sum(axis=(0, 1, 2)))).all()
 
 
+def test_fewer_numbers_than_nodes_carry_the_light_of_pixels():
+    """Fields of few waves on 9 nodes a pixel, pixel by pixel against all nodes."""
+    rng, pixels, nodes, points = np.random.default_rng(7), 6, 9, 4
+    t, w = gauss(nodes)
+    u = (t[:, None] / 2 + np.arange(pixels)).ravel()
+    waves = np.exp(1j * np.linspace(-2, 2, 15) * u[:, None])
+    waves *= np.sqrt(np.repeat(w, pixels) / 2)[:, None]
+    high, wide = (
+        np.stack([waves @ (a + 1j * b) for a, b in rng.normal(size=(points, 2, 15, 5))])
+        for _ in range(2)
+    )
+
+    def seen(down, across):
+        field = np.einsum("avt,but->abvu", down, across)
+        parts = field.reshape(points, points, -1, pixels, across.shape[1] // pixels, pixels)
+        return (abs(parts) ** 2).sum(axis=(2, 4))
+
+    whole = seen(high, wide)
+    light = whole.sum(axis=(2, 3))
+    for most, fewest, many in ((1e-3, 3, 5), (1e-9, 5, 8)):
+        modes = pixel_modes(high, wide, pixels, light, most)
+        assert fewest <= modes.shape[2] <= many
+        lost = whole - seen(on_modes(high, modes), wide)
+        assert (lost > -1e-12 * whole.max()).all()
+        assert (np.linalg.norm(lost, axis=(2, 3)) < 2 * most * light / pixels).all()
+    assert pixel_modes(high, wide, pixels, light, 0).shape[2] == nodes
+
+
 @pytest.mark.parametrize(
-    "f_number, fill, asked", [(1.5, 0.6, 1e-4), (2.5, 0.6, 1e-5), (1.5, 0.9, 1e-5)]
+    "f_number, fill, asked",
+    [(1.5, 0.6, 1e-4), (1.5, 0.9, 1e-4), (2.5, 0.6, 1e-5), (1.5, 0.9, 1e-5)],
 )
 def test_dim_points_between_lenslets_and_steep_corners_hold(f_number, fill, asked):
     """All columns of 3x3 superpixels, against those at a tenth: points that few lenslets light and

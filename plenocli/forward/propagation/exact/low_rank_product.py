@@ -138,7 +138,7 @@ class Product:
             return u, s, vh.T, q
         # what is seen times conj(U) is as long as s
         u, s, _ = self.device.xp.linalg.svd(_only_triangle(seen).T, full_matrices=False)
-        least = self.device.xp.finfo(s.dtype).tiny
+        least = float(self.device.xp.finfo(s.dtype).smallest_normal)
         return u, s, self.device.xp.conj(u) / (s + least), seen
 
     def factors(

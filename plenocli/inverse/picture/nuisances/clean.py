@@ -231,10 +231,10 @@ class _Task:
         guess: likewise, of which the neighbours' light is reckoned.
         """
         shape, seen = y.shape, ~self.blind
-        stray = np.broadcast_to(0.0, shape)
+        stray, typical, own = np.broadcast_to(0.0, shape), 0.0, y.reshape(-1, shape[2])
         if self.estimators.coupled:
             stray = guess - self._own_light(guess)
-        own = (y - stray if self.estimators.coupled else y).reshape(-1, shape[2])
+            typical, own = float(np.mean(np.abs(stray))), (y - stray).reshape(-1, shape[2])
         own = (own if seen.all() else own[seen]).T
         unknown, clipped = self.unknown[seen].T, self.clipped[seen].T
         sign, clean = find_defects(
@@ -247,7 +247,7 @@ class _Task:
         lost = unknown | (sign != 0)
         if hot.any():
             clean = self.model.impute(own, lost | clipped)
-        veil, light = self._veil(clean, clipped.any(axis=0), float(np.mean(np.abs(stray))))
+        veil, light = self._veil(clean, clipped.any(axis=0), typical)
         out, better = y, own
         if lost.any() or clipped.any() or light.any():
             better = self._without(own - light, lost, clipped)

@@ -5,9 +5,10 @@ lines and functions of a size that can be read.
 import ast
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "plenocli"
-TREES = {path: ast.parse(path.read_text()) for path in sorted(PACKAGE.rglob("*.py"))}
 MOST_SUBSCRIPTS = 5
 """String subscripts in 1000 lines outside files/, where texts are keys of a format."""
 MOST_FIELDS = 4
@@ -16,6 +17,14 @@ MOST_LINES = 60
 """Of a function, without signature and docstring."""
 LEAST_ANNOTATED = 0.7
 """Share of all functions, the private ones too, whose arguments and result say their types."""
+
+
+@pytest.fixture(scope="module")
+def trees():
+    """Path -> syntax tree of every module: parsed where the tests run, not wherever they are
+    collected, and gone with them.
+    """
+    return {path: ast.parse(path.read_text()) for path in sorted(PACKAGE.rglob("*.py"))}
 
 
 def functions(tree):
@@ -51,9 +60,9 @@ def dataclasses(tree):
             yield node.name, fields, "kw_only=True" in how[0]
 
 
-def test_texts_are_no_field_names():
+def test_texts_are_no_field_names(trees):
     lines = subscripts = 0
-    for path, tree in TREES.items():
+    for path, tree in trees.items():
         if path.relative_to(PACKAGE).parts[0] != "files":
             lines += len(path.read_text().splitlines())
             subscripts += sum(
@@ -65,25 +74,25 @@ def test_texts_are_no_field_names():
     assert subscripts <= MOST_SUBSCRIPTS * lines / 1000, (subscripts, lines)
 
 
-def test_public_functions_say_their_types():
+def test_public_functions_say_their_types(trees):
     without = [
         f"{path.relative_to(ROOT)}: {function.name}"
-        for path, tree in TREES.items()
+        for path, tree in trees.items()
         for function in public(tree)
         if not annotated(function)
     ]
     assert not without
 
 
-def test_most_functions_say_their_types():
-    found = [annotated(function) for tree in TREES.values() for function in functions(tree)]
+def test_most_functions_say_their_types(trees):
+    found = [annotated(function) for tree in trees.values() for function in functions(tree)]
     assert sum(found) >= LEAST_ANNOTATED * len(found), (sum(found), len(found))
 
 
-def test_many_fields_are_given_by_keyword():
+def test_many_fields_are_given_by_keyword(trees):
     positional = [
         f"{path.relative_to(ROOT)}: {name} has {fields} fields"
-        for path, tree in TREES.items()
+        for path, tree in trees.items()
         for name, fields, by_keyword in dataclasses(tree)
         if fields > MOST_FIELDS and not by_keyword
     ]
@@ -96,15 +105,15 @@ def body(function):
     return function.end_lineno - first.lineno + 1
 
 
-def test_functions_and_lines_can_be_read():
+def test_functions_and_lines_can_be_read(trees):
     long = [
         f"{path.relative_to(ROOT)}: {node.name} has {body(node)} lines"
-        for path, tree in TREES.items()
+        for path, tree in trees.items()
         for node in functions(tree)
         if body(node) > MOST_LINES
     ]
     assert not long
-    wide = [path for path in TREES if any(len(s) > 100 for s in path.read_text().splitlines())]
+    wide = [path for path in trees if any(len(s) > 100 for s in path.read_text().splitlines())]
     assert not wide
 
 

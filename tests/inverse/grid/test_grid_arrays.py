@@ -217,7 +217,7 @@ def test_thin_lines_are_seen_in_an_array_that_is_smaller_than_its_sensor(
     assert np.abs(found.centres - centres - around).max() < 0.05
 
 
-@pytest.mark.parametrize("pitch", [pytest.param(6.0, marks=pytest.mark.slow), 37.3])
+@pytest.mark.parametrize("pitch", [6.0, 37.3])
 def test_dark_surroundings_hold_no_lenslets(pitch):
     array = next(a for a in arrays() if a.pitch == pitch)
     image, truth = render(array)

@@ -19,7 +19,9 @@ from plenocli.execution.pool import InProcess
 from plenocli.files.artefacts.reading import Stored, read_artefact
 from plenocli.files.read import captures
 from plenocli.inverse.picture import tiles
-from plenocli.stages.inverse.reconstruct import in_tiles
+from plenocli.inverse.picture.estimate import estimate
+from plenocli.inverse.picture.solvers import block_matching
+from plenocli.stages.inverse.reconstruct import in_tiles, one_capture
 from plenocli.stages.inverse.reconstruct import run as stage
 from plenocli.stages.inverse.reconstruct.recipe import Settings, recipe_of
 from tests.stages import test_reconstruct
@@ -133,6 +135,23 @@ def test_results_do_not_depend_on_workers(folder, tmp_path, small_tiles, kind, m
             made / kind, tmp_path / f"{workers}.h5", "--workers", workers, method=method
         )
         assert found.data["image/value"].shape == (COUNT * N, COUNT * N)
+    assert (tmp_path / "1.h5").read_bytes() == (tmp_path / "2.h5").read_bytes()
+
+
+@pytest.mark.parametrize("method", ["lmmse", "pnp"])
+def test_workers_of_a_single_tile_change_no_byte(folder, tmp_path, monkeypatch, method):
+    made, threads = folder[0], []
+
+    def watched(*arguments, **options):
+        threads.append(budget().threads)
+        return estimate(*arguments, **options)
+
+    monkeypatch.setattr(block_matching, "TOGETHER", 60)
+    monkeypatch.setattr(one_capture, "estimate", watched)
+    for workers in ("1", "2"):
+        name = tmp_path / f"{workers}.h5"
+        picture(made / "coupled", name, "--workers", workers, method=method)
+    assert threads == [1, 2]
     assert (tmp_path / "1.h5").read_bytes() == (tmp_path / "2.h5").read_bytes()
 
 

@@ -169,10 +169,10 @@ def command(
     lenslet's object the sensor can see at all) or .exr; with several captures a folder with one
     file each. CAPTURE may be a folder: the captures in it. Finished ones are skipped on a rerun, a
     bad one is reported and does not stop the others. --workers and --scheduler share captures out,
-    or of a single one tiles, or batches of its lenslets (nnls, dictionary). A capture of more than
-    some hundred to thousand lenslets is estimated tile by tile, so that memory does not grow with
-    the sensor; a run that was killed goes on from its tiles. With --calibration and no --pif
-    the picture has one value a lenslet.
+    or of a single one tiles, batches of its lenslets (nnls, dictionary) or strips of its picture.
+    A capture of more than some hundred to thousand lenslets is estimated tile by tile, so that
+    memory does not grow with the sensor; a run that was killed goes on from its tiles. With
+    --calibration and no --pif the picture has one value a lenslet.
 
     \b
     Examples:

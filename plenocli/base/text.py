@@ -69,6 +69,11 @@ def _escaped(character: str) -> str:
     return f"\\x{ord(character) - 0xDC00:02x}" if lone_byte else ascii(character)[1:-1]
 
 
+def counted(count: int, what: str) -> str:
+    """`count` of something, whose plural has an s."""
+    return f"{count} {what}" if count == 1 else f"{count} {what}s"
+
+
 def by(shape: Iterable[int]) -> str:
     """ "4 x 6" of (4, 6)."""
     return " x ".join(str(int(n)) for n in shape)

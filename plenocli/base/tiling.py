@@ -226,7 +226,7 @@ def bands(count: int, most: int) -> list[slice]:
 
 def even_bands(count: int, most: int) -> list[slice]:
     """As few bands as `bands` gives, as long as each other."""
-    return bands(count, -(-count // max(1, -(-count // max(1, most)))))
+    return bands(count, -(-count // max(1, len(bands(count, most)))))
 
 
 def spread_bands(count: int, most: int, work: Callable[[slice], object]) -> None:

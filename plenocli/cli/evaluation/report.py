@@ -42,6 +42,7 @@ def command(
     Example:
       plenocli report runs/demo -o runs/demo/report.html --view runs/demo/view.html --overwrite
     """
+    from plenocli.base.text import counted
     from plenocli.stages.evaluation.report import run_report
 
     made = run_report(run_folder, output, title=title, view=view, overwrite=overwrite)
@@ -50,5 +51,5 @@ def command(
         made.as_json(),
         as_json,
         f"{output}: {', '.join(made.sections) or 'no pictures'}; "
-        f"{made.files} file{'s' * (made.files != 1)}{missing}",
+        f"{counted(made.files, 'file')}{missing}",
     )

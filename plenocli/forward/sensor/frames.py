@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike
 
 from plenocli.base.errors import InputError
+from plenocli.base.text import by
 from plenocli.base.tiling import EVERYTHING, Plane
 from plenocli.forward.sensor.noise import Noise
 
@@ -134,6 +135,22 @@ def saturated(values: np.ndarray, black: ArrayLike, white: float | None) -> np.n
         return np.zeros(values.shape, bool)
     top = tiled(np.asarray(black) + SATURATION * (white - np.asarray(black)), values.shape)
     return values >= top
+
+
+def require_sensor(
+    shape: Sequence[int], calibrated: Sequence[int], path: str | Path | None
+) -> None:
+    """InputError for a capture of another sensor than that of its calibration.
+
+    shape, calibrated: (rows, columns) px.
+    path: of the capture.
+    """
+    if tuple(shape) != tuple(calibrated):
+        raise InputError(
+            f"is {by(shape)} px, the calibration {by(calibrated)}",
+            path,
+            "use captures of the calibrated camera",
+        )
 
 
 def require_in_reach(signal: np.ndarray, path: str | Path | None) -> None:

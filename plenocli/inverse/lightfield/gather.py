@@ -13,10 +13,9 @@ import numpy as np
 
 from plenocli.base.budget import budget
 from plenocli.base.errors import InputError
-from plenocli.base.text import by
 from plenocli.base.tiling import EVERYTHING, Plane, bands
 from plenocli.forward.sensor.cfa import cfa_map
-from plenocli.forward.sensor.frames import require_in_reach
+from plenocli.forward.sensor.frames import require_in_reach, require_sensor
 from plenocli.inverse.lightfield.samples import (
     AT_ONCE,
     TEMPORARY_BYTES,
@@ -246,18 +245,13 @@ def _along_grid(
 ) -> _Sensor:
     """Along the grid of a calibration, relative to its white image."""
     white, grid = calibration.white, calibration.grid
-    if white is not None and white.flat is not None and white.flat.shape != shot.shape:
-        raise InputError(
-            f"is {by(shot.shape)} px, the calibration {by(white.flat.shape)}",
-            shot.metadata.path,
-            "use captures of the calibrated camera",
-        )
     if white is None or white.flat is None:
         raise InputError(
             "holds no white image of this sensor",
             path,
             "calibrate with the white image of the camera that took the capture",
         )
+    require_sensor(shot.shape, white.flat.shape, shot.metadata.path)
     # the flat image is 1 in every superpixel: what light each has comes back
     level = 1.0 if white.level is None else float(np.nanmedian(white.level))
     mosaic, flat = Plane.of(shot.mosaic), Plane.of(white.flat)

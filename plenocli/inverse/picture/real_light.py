@@ -21,6 +21,7 @@ from plenocli.base.errors import InputError
 from plenocli.base.progress import note
 from plenocli.base.text import by
 from plenocli.base.tiling import EVERYTHING, Plane, Room, bands
+from plenocli.forward.sensor.frames import require_sensor
 from plenocli.forward.sensor.noise import Noise
 from plenocli.forward.sensor.superpixel import extract_rows
 from plenocli.inverse.calibration.calibration import there
@@ -219,12 +220,8 @@ def above_dark(capture: Capture, calibration: Calibration, rows: slice = EVERYTH
     Raises InputError where the two sensors differ.
     """
     dark = there(calibration.dark).mean
-    if len(dark.shape) == 2 and dark.shape != capture.shape:
-        raise InputError(
-            f"is {by(capture.shape)} px, the calibration {by(dark.shape)}",
-            capture.metadata.path,
-            "use captures of the calibrated camera",
-        )
+    if len(dark.shape) == 2:
+        require_sensor(capture.shape, dark.shape, capture.metadata.path)
     reference = calibration.sensor.exposure
     scale = reference / capture.exposure_s if reference and capture.exposure_s else 1.0
     own = Plane.of(dark).read(rows, EVERYTHING) if len(dark.shape) == 2 else dark

@@ -15,6 +15,7 @@ import numpy as np
 
 from plenocli.base.errors import InputError, NumericsError
 from plenocli.base.tiling import FORGETFUL, Keeper, bands, kept
+from plenocli.forward.sensor.frames import require_sensor
 from plenocli.forward.sensor.noise import Noise
 from plenocli.inverse.spectra.bands import with_polarisation
 from plenocli.inverse.spectra.demultiplex import demultiplex, noise_variance
@@ -54,15 +55,7 @@ def readout(
     from plenocli.forward.sensor.readout import Readout
 
     sensor, shape = c.calibration.sensor, c.dark.mean.shape
-    if exposure.shape != shape:
-        raise InputError(
-            (
-                f"is {exposure.shape[0]} x {exposure.shape[1]} px, the calibration "
-                f"{shape[0]} x {shape[1]}"
-            ),
-            path,
-            "use captures of the calibrated camera",
-        )
+    require_sensor(exposure.shape, shape, path)
     if exposure.units != sensor.units:
         raise InputError(
             f"is in {exposure.units}, the calibration in {sensor.units}",

@@ -32,12 +32,12 @@ class Sealed:
 
     def line(self) -> str:
         """In words."""
-        from plenocli.base.text import printable
+        from plenocli.base.text import counted, printable
 
         if self.changes is None:
             told = "what was changed in it is not known; --was ORIGINAL tells"
             if self.path.is_dir():
-                return f"{self.path}: {self.files} file{'s' * (self.files != 1)} sealed"
+                return f"{self.path}: {counted(self.files, 'file')} sealed"
         elif not self.changes:
             told = "nothing has changed"
         else:

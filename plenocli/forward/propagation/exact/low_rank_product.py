@@ -124,17 +124,14 @@ class Product:
         seen = xp.concat([seen, self._through_basis(new)], axis=1)
         return xp.concat([q, new], axis=1), seen
 
-    def _core(self, q: Any, seen: Any) -> tuple[Any, Any]:
-        """(P, K) with Q Q^H M = Q K P^T, P orthonormal and Q where M is symmetric."""
-        if self.symmetric:
-            return q, seen.T @ self._through(0, seen)
-        p, triangle = _triangle(seen)
-        return p, triangle.T
+    def _core(self, seen: Any) -> Any:
+        """K with Q Q^H M = Q K Q^T, of a symmetric M."""
+        return seen.T @ self._through(0, seen)
 
     def _values(self, q: Any, seen: Any) -> tuple[Any, Any, Any, Any]:
         """(U, s, V, P): Q Q^H M = Q U diag(s) (P V)^T, P = Q where M is symmetric, else `seen`."""
         if self.symmetric:
-            u, s, vh = self.device.xp.linalg.svd(self._core(q, seen)[1], full_matrices=False)
+            u, s, vh = self.device.xp.linalg.svd(self._core(seen), full_matrices=False)
             return u, s, vh.T, q
         # what is seen times conj(U) is as long as s
         u, s, _ = self.device.xp.linalg.svd(_only_triangle(seen).T, full_matrices=False)
@@ -230,7 +227,7 @@ class Product:
             return None
         x = orthonormal(self._times(0, directions))
         seen = self._through_basis(x)
-        y, core = self._core(x, seen) if self.symmetric else (seen, _like(x, np.eye(x.shape[1])))
+        y, core = (x, self._core(seen)) if self.symmetric else (seen, _like(x, np.eye(x.shape[1])))
         if self._missed(x, core, y) > 2 * cut:
             return None
         here = home(x)
@@ -251,7 +248,7 @@ class Product:
         basis = orthonormal(_adjoint(core) @ basis)
         image = core @ basis
         rest = float(linalg.matrix_norm(core - image @ _adjoint(basis)))
-        _, s, vh = linalg.svd(_triangle(image)[1], full_matrices=False)
+        _, s, vh = linalg.svd(_only_triangle(image), full_matrices=False)
         # the k largest also fit what is random here, so that less than all of the rest is seen
         share = 1 - np.arange(count) * (1 / many - 1 / self.limit)
         terms = terms_within(self.device.get(s), cut * share, rest)

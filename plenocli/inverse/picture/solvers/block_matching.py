@@ -67,23 +67,23 @@ def block_matching(picture: np.ndarray, sigma: float, matched: Matched | None = 
         for strip in strips
     ]
     most = max(span.stop - span.start for span in spans) * width * patch**2
-    rooms: dict[int, np.ndarray] = {}
+    # no page of it is fetched before it is written
+    rooms = np.empty((threads, 2, 0 if kernel is None else most), np.float32)
     found: dict[int, tuple[np.ndarray, np.ndarray]] = {}
 
     def clear(number: int) -> None:
-        strip, part = strips[number], source[spans[number], :]
+        strip, span = strips[number], spans[number]
+        part = source[span, :]
         if strip[0] not in matched:
             match = _match if kernel is None else kernel.match
-            like = match(part, strip - spans[number].start, columns, patch, SEARCH, stack)
+            like = match(part, strip - span.start, columns, patch, SEARCH, stack)
             matched[strip[0]] = xp.asarray(like, dtype=xp.int32)
-        if kernel is None:
-            found[number] = _filter(part, matched[strip[0]], patch, sigma)
-            return
-        own = number % threads
-        if own not in rooms:
-            rooms[own] = np.empty((2, most), np.float32)
-        alike = matched[strip[0]]
-        found[number] = _filter_compiled(part, alike, patch, sigma, kernel, rooms[own])
+        alike, room = matched[strip[0]], rooms[number % threads]
+        found[number] = (
+            _filter(part, alike, patch, sigma)
+            if kernel is None
+            else _filter_compiled(part, alike, patch, sigma, kernel, room)
+        )
 
     for some in bands(len(strips), threads):
         spread([(number,) for number in range(some.start, some.stop)], clear)

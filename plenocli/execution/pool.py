@@ -32,7 +32,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from plenocli import __version__
-from plenocli.base.budget import Budget, budget, one_thread, set_budget
+from plenocli.base.budget import Budget, budget, one_thread, set_budget, within
 from plenocli.base.errors import OutputError, PlenoError, UsageError
 from plenocli.base.progress import collected_notes, note
 from plenocli.base.text import how_to_install
@@ -61,7 +61,8 @@ def open_pool(
     workers: processes beside this one; 1 runs every task here.
     scheduler: address of a Dask scheduler, or the file that it wrote; then its workers serve,
         however many they are.
-    threads: workers are threads of this process.
+    threads: workers are threads of this process; those that find no task left work on parts of the
+        last ones (plenocli.base.budget.spread).
 
     Raises UsageError where there is no such scheduler.
     """
@@ -78,9 +79,8 @@ def open_pool(
     elif threads:
         with (
             _one_thread(),
-            contextlib.closing(
-                _Executing(lambda: ThreadPoolExecutor(workers), lambda: workers + 1, attempt)
-            ) as pool,
+            within(),
+            contextlib.closing(_Threads(workers)) as pool,
         ):
             yield pool
     else:
@@ -325,6 +325,27 @@ class _Executing:
             future.cancel()
         executor, self._executor = self._executor, None
         _stop(executor, bool(self._running))
+
+
+class _Threads(_Executing):
+    """A Pool of threads. Whoever asks for a result while there are fewer tasks than threads has no
+    more to hand in: then the budget has threads for parts of those that are left.
+    """
+
+    def __init__(self, workers: int) -> None:
+        super().__init__(lambda: ThreadPoolExecutor(workers), lambda: workers + 1, attempt)
+        self._workers, self._own = workers, budget().threads
+
+    def submit(self, token: Any, function: Callable[[Any], Any], task: Any) -> None:
+        """Hand in a task."""
+        set_budget(replace(budget(), threads=self._own))
+        super().submit(token, function, task)
+
+    def next(self) -> tuple[Any, Any]:
+        """(token, result or PlenoError) of a task that has ended."""
+        each = self._workers // max(1, sum(not future.done() for future in self._running))
+        set_budget(replace(budget(), threads=max(self._own, each)))
+        return super().next()
 
 
 def _stop(executor: Executor | None, busy: bool) -> None:

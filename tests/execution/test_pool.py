@@ -7,12 +7,13 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from functools import partial
 
 import pytest
 
-from plenocli.base.budget import Budget, within
+from plenocli.base.budget import Budget, budget, within
 from plenocli.base.errors import InputError, UsageError
 from plenocli.base.progress import collected_notes, note
 from plenocli.execution import pool as pools
@@ -94,6 +95,32 @@ def test_a_task_has_the_budget_of_who_hands_it_in(tasks):
     for options in ({"workers": 1}, {"workers": 2}, {"workers": 2, "threads": True}):
         with within(Budget(12345)), open_pool(**options) as pool:
             assert results(pool, tasks.memory, range(3)) == {0: 12345, 1: 12345, 2: 12345}
+
+
+def test_threads_without_a_task_serve_the_last_ones():
+    """Two of four threads find no task: each of two that are left may use two, and the last all
+    four; what is handed in afterwards has one, as what comes after the pool.
+    """
+    seen = {}
+    done = {n: threading.Event() for n in range(6)}
+
+    def task(n):
+        if n > 3:  # until the ones before have ended
+            done[n - 1 if n == 5 else 3].wait(10)
+            deadline = time.monotonic() + 10
+            while budget().threads < (2 if n == 4 else 4) and time.monotonic() < deadline:
+                time.sleep(0.001)
+        seen[n] = budget().threads
+
+    with within(Budget(1 << 30)):
+        with open_pool(4, threads=True) as pool:
+            for n, _ in run_all(pool, ((n, task, n) for n in range(6))):
+                done[n].set()
+            pool.submit("next", task, 0)
+            assert budget().threads == 1
+            pool.next()
+        assert budget().threads == 1
+    assert (seen[4], seen[5]) == (2, 4)
 
 
 def test_a_fault_of_ours_is_not_a_result(tasks):

@@ -25,8 +25,10 @@ from plenocli.forward.propagation.exact.low_rank_product import thin
 from plenocli.forward.propagation.exact.oblique import at_points, orders_of
 from plenocli.forward.propagation.exact.residual import ObliqueWave, Residual, path, split
 from plenocli.forward.propagation.fresnel.spread_function import (
+    carried,
     legendre,
     legendre_sum,
+    psf_nodes,
     terms_within,
 )
 
@@ -37,6 +39,8 @@ if TYPE_CHECKING:
 
 ROWS_AT_ONCE = 256
 """Rows whose squares are added up together, so that sums in single precision stay short."""
+SHARE = 0.01
+"""Of what the terms on a lenslet may miss: what is lost by carrying them on few functions."""
 AT_ONCE = 1 << 19
 """Numbers of a field that are brought to pixels together: they stay in the caches."""
 
@@ -96,6 +100,7 @@ class Interval:
 
     `place`: the lenslet's nodes x (m) from the axis;
     terms: LocalTerms there;
+    onto, values: functions that carry these for all points, as `_functions` has them;
     weigh: R with R^H R the overlaps of what they bring to the superpixel.
 
     f: focal length of a hyperbolic lenslet, None for a parabolic one;
@@ -121,8 +126,8 @@ class Interval:
         self.aside, self.across = (g.chief[n] * g.z3 / g.z2 for n in (axis, 1 - axis))
         self.chief, self.chief_across = g.chief[axis], g.chief[1 - axis]
         self.offset = s * g.superpixel_pitch - m * g.D2 + self.aside
-        t, w = gauss(nodes_for(half * self._slope(m * g.D2, half)))
-        self.x, self.w = half * t, half * w
+        fine = nodes_for(half * self._slope(m * g.D2, half))
+        self.x = half * gauss(fine)[0]
         self.place = m * g.D2 + self.x
         reach = half + np.abs(g.points(axis)).max()
         self.terms = LocalTerms(
@@ -132,12 +137,37 @@ class Interval:
             min(m * g.D2 + reach, field.half),
             tolerance,
         )
-        values = self.terms.evaluate(self.place[:, None] - side.points, side.points)
-        values = (values * side.emphasis[:, None]).transpose(0, 2, 1)  # (x, term, point)
-        kind = dtype if np.iscomplexobj(values) else dtype.type().real.dtype
-        self.values = np.ascontiguousarray(values, kind)
+        self.onto, self.values = self._functions(m * g.D2, fine, SHARE * tolerance)
         power, vectors = np.linalg.eigh(self._gram())
         self.weigh = np.sqrt(np.maximum(power, 0))[:, None] * vectors.conj().T
+
+    def _functions(
+        self, middle: float, fine: int, tolerance: float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Functions on the lenslet that carry the main lens's field of all points, which swings
+        less than the kernel: as few as that takes.
+
+        middle: of the lenslet, m from the axis;
+        fine: nodes on which the kernel is known;
+        tolerance: root energy of a mean point's field that may be lost.
+
+        Returns (fine node, function), the rule's weights in it, and (function, term, point), the
+        terms on these.
+        """
+        g, points = self.geometry, self.side.points
+        half = g.lenslet_width / 2
+        few = min(fine, psf_nodes(g, half))
+        t, w = gauss(few)
+        root = np.sqrt(half * w)[:, None]
+        values = self.terms.evaluate(middle + half * t[:, None] - points, points)
+        values = (values * self.side.emphasis[:, None]).transpose(0, 2, 1) * root[:, :, None]
+        weighed = (values * self.terms.strength[:, None]).reshape(few, -1)
+        basis, s, _ = np.linalg.svd(np.linalg.qr(weighed.T, mode="r").T, full_matrices=False)
+        basis = basis[:, : terms_within(s, tolerance * math.sqrt(len(points)))]
+        kind = self.dtype if np.iscomplexobj(values) else self.dtype.type().real.dtype
+        seen = basis.conj().T @ values.reshape(few, -1)
+        onto = half * carried(fine, few) @ (basis / root)
+        return onto.astype(kind), seen.astype(kind).reshape(-1, *values.shape[1:])
 
     def _slope(self, middle: float, half: float) -> float:
         """Largest slope (rad/m) of the integrand's phase: of the way to either end of the
@@ -166,7 +196,7 @@ class Interval:
             + self._incoming()
         )
         phase = phase - (self.x**2 / (2 * g.f2) if self.parabolic else path(self.x, g.f2))
-        size = self.w * self._nearer() / math.sqrt(g.wavelength * g.z3)
+        size = self._nearer() / math.sqrt(g.wavelength * g.z3)
         return (self.side.root[:, None] * size) * np.exp(1j * g.k * phase)
 
     def _own_path(self, u: np.ndarray) -> np.ndarray:
@@ -233,7 +263,7 @@ class Interval:
         terms, points = self.values.shape[1:]
         sheet = np.empty((self.side.lines, terms, points), self.dtype)
         wave = self.side.carry(self.wave(self.across).astype(self.dtype))
-        _multiply(wave, self.values, out=sheet)
+        _multiply(wave, self.onto, self.values, out=sheet)
         gram = np.zeros((terms, terms), complex)
         for line in sheet:
             gram += line.conj() @ line.T
@@ -266,7 +296,7 @@ class Interval:
                 # strong ones come first: most often all up to the weakest, which need no copy
                 few = values[:, : len(terms)] if terms[-1] < len(terms) else values[:, terms]
                 side = self.side.carry((wave * term).astype(self.dtype))
-                _multiply(side, few, out=out[:, some[0] : some[-1] + 1])
+                _multiply(side, self.onto, few, out=out[:, some[0] : some[-1] + 1])
         return out
 
 
@@ -427,6 +457,8 @@ def _strong(power: np.ndarray, tolerance: float) -> tuple[np.ndarray, ...]:
 class LocalTerms:
     """An orthonormal basis e_i on [low, high] of the terms of h along one axis, cut at
     `tolerance` of the whole field.
+
+    strength: (i,), root energy of what each carries of it.
     """
 
     def __init__(
@@ -445,6 +477,7 @@ class LocalTerms:
         # the partner of a term has the norm sqrt(s), which weighs it
         u, s, _ = np.linalg.svd(values[axis] * field_norms(field, 1 - axis), full_matrices=False)
         basis = u[:, : terms_within(s, tolerance)]
+        self.strength = s[: basis.shape[1]]
         self._mixing = [basis.conj().T @ v for v in values]
         degrees = np.arange(count)
         project = legendre(t, count, 1).T * w * ((2 * degrees + 1) / 2)[:, None]
@@ -479,12 +512,14 @@ def field_norms(field: SeparableField, axis: int) -> np.ndarray:
     return np.sqrt(power.reshape(orders_of(field), -1).sum(axis=0))
 
 
-def _multiply(kernel: np.ndarray, values: np.ndarray, out: np.ndarray) -> None:
-    """out (line, term, point) = kernel (line, x) complex @ values (x, term, point) of the same
-    precision, real or complex, by slices of rows that lie together.
+def _multiply(kernel: np.ndarray, onto: np.ndarray, values: np.ndarray, out: np.ndarray) -> None:
+    """out (line, term, point) = kernel (line, x) complex @ onto (x, function) @ values (function,
+    term, point) of the same precision, both real or both complex, by slices of rows that lie
+    together.
     """
     flat, target = (a.reshape(len(a), -1) for a in (values, out))
     if np.iscomplexobj(values):
-        np.matmul(kernel, flat, out=target)
+        np.matmul(kernel @ onto, flat, out=target)
     else:
-        target.real, target.imag = np.vsplit(np.concatenate([kernel.real, kernel.imag]) @ flat, 2)
+        parts = np.concatenate([kernel.real, kernel.imag]) @ onto
+        target.real, target.imag = np.vsplit(parts @ flat, 2)

@@ -20,8 +20,13 @@ import numpy as np
 
 from plenocli.base.device import CPU, Device, beside, namespace
 from plenocli.base.errors import NumericsError
-from plenocli.base.tiling import spread_bands
-from plenocli.forward.propagation.complex_products import THREE_SERVE, product_of_thirds, thirds
+from plenocli.base.tiling import even_bands, spread_bands
+from plenocli.forward.propagation.complex_products import (
+    THREE_SERVE,
+    Thirds,
+    product_of_thirds,
+    thirds,
+)
 from plenocli.forward.propagation.fresnel.spread_function import terms_within
 
 if TYPE_CHECKING:
@@ -41,8 +46,10 @@ SMALL = 40
 """Terms of factors that are not worth narrowing."""
 THIN = 1e-13
 """Entries of a coupling below this share of its largest are rounding of double precision."""
-ROWS = 1024
-"""Rows of a product that are made together."""
+ROWS, DEPTH = 1024, 2048
+"""Rows of a product that are made together, from so many of what it sums over: fresh pages for the
+parts of large matrices take longer than what is moved.
+"""
 MAX_SKETCH = 2500
 """Columns of the largest sketch: beyond it the set-up takes minutes and the model is refused."""
 
@@ -108,7 +115,7 @@ class Product:
 
     def _seen(self, q: Any) -> Any:
         """X^T q* of the factors."""
-        return _product(self.left.T, self.device.xp.conj(q))
+        return _product(self.left.T, q, conjugate=True)
 
     def _extend(self, q: Any | None, seen: Any | None, count: int) -> tuple[Any, Any]:
         """The basis q of M's range (None: not begun) with columns added up to `count`, and what
@@ -310,24 +317,37 @@ def _places(terms: Sequence[int]) -> list[slice]:
     return [slice(end - n, end) for n, end in zip(terms, ends)]
 
 
-def _product(x: Any, y: Any) -> Any:
-    """x @ y; large ones of NumPy by three real products, rows at a time."""
-    if not isinstance(x, np.ndarray) or min(*x.shape, y.shape[1]) < THREE_SERVE:
-        return x @ y
-    if not (np.iscomplexobj(x) and np.iscomplexobj(y)):
-        return x @ y
-    out, parts = np.empty((len(x), y.shape[1]), x.dtype), thirds(y)
-    places = local()  # a thread's for its products
+def _product(x: Any, y: Any, conjugate: bool = False) -> Any:
+    """x @ y, or x @ y*; large ones of NumPy by three real products, in blocks."""
+    if (
+        not isinstance(x, np.ndarray)
+        or min(*x.shape, y.shape[1]) < THREE_SERVE
+        or not (np.iscomplexobj(x) and np.iscomplexobj(y))
+    ):
+        return x @ (namespace(y).conj(y) if conjugate else y)
+    out, places = np.empty((len(x), y.shape[1]), x.dtype), local()  # a thread's for its products
+    for inner in even_bands(len(y), DEPTH):
+        parts = thirds(y[inner])
+        if conjugate:
+            np.negative(parts[1], out=parts[1])
+            np.add(parts[0], parts[1], out=parts[2])
 
-    def work(rows: slice) -> None:
-        if not hasattr(places, "own"):
-            places.own = np.empty((3, min(ROWS, len(x)), y.shape[1]), x.real.dtype)
-        part, target = x[rows], out[rows]
-        target.real, target.imag = product_of_thirds(
-            thirds(part), parts, places.own[:, : len(part)]
-        )
+        def work(rows: slice, inner: slice = inner, parts: Thirds = parts) -> None:
+            if not hasattr(places, "own"):
+                many = min(ROWS, len(x))
+                places.own = np.empty((3, many, y.shape[1]), x.real.dtype)
+                places.left = np.empty((3, many * min(DEPTH, len(y))), x.real.dtype)
+            part, target = x[rows, inner], out[rows]
+            real, imaginary = product_of_thirds(
+                thirds(part, places.left), parts, places.own[:, : len(part)]
+            )
+            if inner.start:
+                target.real += real
+                target.imag += imaginary
+            else:
+                target.real, target.imag = real, imaginary
 
-    spread_bands(len(x), ROWS, work)
+        spread_bands(len(x), ROWS, work)
     return out
 
 

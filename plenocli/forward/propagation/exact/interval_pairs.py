@@ -286,7 +286,7 @@ class Interval:
 
         Returns (lines of the sensor, pair, points).
         """
-        wave, (kept_r, kept_i) = self.wave(other), kept
+        wave, (kept_r, kept_i) = self.wave(other).astype(self.dtype), kept
         values = mixing.T.astype(self.values.dtype) @ self.values
         out = np.empty((self.side.lines, len(kept_r), values.shape[2]), self.dtype)
         for r, term in enumerate(functions(self.side.u, self.x, self.dtype)):
@@ -295,7 +295,7 @@ class Interval:
                 terms = kept_i[some]
                 # strong ones come first: most often all up to the weakest, which need no copy
                 few = values[:, : len(terms)] if terms[-1] < len(terms) else values[:, terms]
-                side = self.side.carry((wave * term).astype(self.dtype))
+                side = self.side.carry(wave * term)
                 _multiply(side, self.onto, few, out=out[:, some[0] : some[-1] + 1])
         return out
 

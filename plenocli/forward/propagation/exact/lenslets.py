@@ -11,6 +11,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from threading import Lock
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -210,14 +211,41 @@ _Part = tuple[np.ndarray, Interval, float]
 the superpixel is along the other (m)."""
 
 
-def _side_by_side(parts: Sequence[_Part], alone: bool) -> np.ndarray:
+class _Places:
+    """Memory of large matrices that is used again: a fresh page takes longer than what is written
+    on it.
+    """
+
+    def __init__(self) -> None:
+        self._free: list[np.ndarray] = []
+        self._taking = Lock()
+
+    def take(self, shape: tuple[int, int], dtype: np.dtype) -> np.ndarray:
+        """An array of whatever is there."""
+        needed = math.prod(shape) * dtype.itemsize
+        with self._taking:
+            fits = [n for n, place in enumerate(self._free) if len(place) >= needed]
+            number = min(fits, key=lambda n: len(self._free[n]), default=None)
+            place = None if number is None else self._free.pop(number)
+        place = np.empty(needed, np.uint8) if place is None else place
+        return place[:needed].view(dtype).reshape(shape)
+
+    def give(self, matrix: np.ndarray) -> None:
+        """Back what was taken, and nobody uses any more."""
+        while matrix.base is not None:
+            matrix = matrix.base
+        with self._taking:
+            self._free.append(matrix)
+
+
+def _side_by_side(parts: Sequence[_Part], alone: bool, places: _Places) -> np.ndarray:
     """Terms of all parts, (rows, terms): on what carries a lenslet alone, or where lenslets
-    interfere, on the pixels.
+    interfere, on the pixels, in one of the places.
     """
     if alone:
         return parts[0][0] if len(parts) == 1 else np.concatenate([p[0] for p in parts], axis=1)
     ends = np.cumsum([factor.shape[1] for factor, _, _ in parts])
-    out = np.empty((parts[0][1].side.pixel_rows, ends[-1]), parts[0][0].dtype)
+    out = places.take((parts[0][1].side.pixel_rows, int(ends[-1])), parts[0][0].dtype)
     for end, (factor, interval, other) in zip(ends, parts):
         interval.on_pixels(factor, other, out[:, end - factor.shape[1] : end])
     return out
@@ -252,6 +280,7 @@ class ExactSquareLenslets(LensletFields):
         self._sensor_sides: dict[tuple[int, int, bool], SensorSide] = {}
         self._intervals: dict[tuple[int, int, int, bool], Interval] = {}
         self._tables: dict[tuple[int, int], Factors] = {}
+        self._places = _Places()
         products: dict[tuple[int, int], int] = {}
         largest_first = self._pairs()[::-1]
 
@@ -268,7 +297,7 @@ class ExactSquareLenslets(LensletFields):
                 ],
                 self._follow,
             )
-        self._intervals = {}
+        self._intervals, self._places = {}, _Places()
         self.notes = FieldNotes(
             separable_terms=max(t.high.shape[3] for t in self._tables.values()),
             field_tail=self._field.tail,
@@ -527,8 +556,8 @@ class ExactSquareLenslets(LensletFields):
                 couplings[first, first] = coupling
         right = left if lit.symmetric else right
         terms = [part[0].shape[1] for part in left], [part[0].shape[1] for part in right]
-        high = _side_by_side(left, lit.alone)
-        wide = high if lit.symmetric else _side_by_side(right, lit.alone)
+        high = _side_by_side(left, lit.alone, self._places)
+        wide = high if lit.symmetric else _side_by_side(right, lit.alone, self._places)
         return Product(high, wide, couplings, lit.symmetric, self.device, terms)
 
     def _joined(self, lit: _Lit) -> tuple[Factors, int]:
@@ -540,6 +569,11 @@ class ExactSquareLenslets(LensletFields):
             if lit.spanned
             else product.factors(lit.whole, lit.guess, self._worst(*lit.at))
         )
+        if not lit.alone and self.device.xp is np:
+            self._places.give(product.left)
+            if not lit.symmetric:
+                self._places.give(product.right)
+        del product
         (sy, sx), beside = lit.at, all(lit.at)
         sides = self._sensor_side(sy, 0, beside), self._sensor_side(sx, 1, beside)
         shown = None
@@ -592,10 +626,10 @@ class ExactSquareLenslets(LensletFields):
         """(pixels' nodes x points, terms) to (points, pixels' nodes, terms), all points as they
         are.
         """
-        real, points = factor.real.dtype, len(side.points)
-        factor = factor.reshape(-1, points, factor.shape[1])
-        factor = factor / side.emphasis.astype(real)[:, None]
-        return np.ascontiguousarray(factor.transpose(1, 0, 2)).astype(self.dtype, copy=False)
+        points, terms = len(side.points), factor.shape[1]
+        emphasis = side.emphasis.astype(factor.real.dtype)[:, None, None]
+        turned = factor.reshape(-1, points, terms).transpose(1, 0, 2)
+        return np.divide(turned, emphasis, out=np.empty(turned.shape, self.dtype))
 
     # what the builder asks for
 

@@ -21,10 +21,13 @@ import numpy as np
 from plenocli.base.device import CPU, Device, beside, namespace
 from plenocli.base.errors import NumericsError
 from plenocli.base.tiling import even_bands, spread_bands
-from plenocli.forward.propagation.complex_products import (
+from plenocli.forward.propagation.complex_matrices import (
     THREE_SERVE,
     Thirds,
+    is_tall,
     product_of_thirds,
+    tall_basis,
+    tall_triangle,
     thirds,
 )
 from plenocli.forward.propagation.fresnel.spread_function import terms_within
@@ -178,7 +181,7 @@ class Product:
             ):
                 if worst is None:
                     return home(_product(q, u)), home(_product(p, v))
-                return high[:, :terms].copy(), wide[:, :terms].copy()
+                return high[:, :terms], wide[:, :terms]
             if size >= MAX_SKETCH:
                 raise _too_many(size)
             size = min(most, max(size + size // 4, int(terms / FILL) + 8))
@@ -383,8 +386,14 @@ def _combined(x: Any, order: np.ndarray, signs: np.ndarray, count: int) -> Any:
     xp, rows = namespace(x), len(order)
     whole = -(-rows // count) * count
     signs, order = np.pad(signs, (0, whole - rows)), np.pad(order, (0, whole - rows))
-    parts = (slice(start, start + count) for start in range(0, whole, count))
-    return sum(xp.take(x, beside(x, order[p]), axis=0) * _like(x, signs[p, None]) for p in parts).T
+    total = 0
+    for start in range(0, whole, count):
+        some = slice(start, start + count)
+        part = xp.take(x, beside(x, order[some]), axis=0)
+        part *= _like(x, signs[some, None])
+        part += total
+        total = part
+    return total.T
 
 
 def _like(array: Any, values: np.ndarray) -> Any:
@@ -406,12 +415,14 @@ def _beside_basis(q: Any, columns: Any) -> tuple[Any, Any]:
 
 
 def orthonormal(columns: Any) -> Any:
-    """An orthonormal basis of the columns."""
+    """An orthonormal basis of the columns, which may be overwritten."""
     return _triangle(columns)[0]
 
 
 def _triangle(columns: Any) -> tuple[Any, Any]:
-    """(Q, R) with columns = Q R, Q orthonormal, R triangular."""
+    """(Q, R) with columns = Q R, Q orthonormal, R triangular; columns may be overwritten."""
+    if is_tall(columns):
+        return tall_basis(columns)
     if not isinstance(columns, np.ndarray):
         return tuple(namespace(columns).linalg.qr(columns))
     from scipy.linalg import qr
@@ -420,7 +431,9 @@ def _triangle(columns: Any) -> tuple[Any, Any]:
 
 
 def _only_triangle(columns: Any) -> Any:
-    """R of `_triangle`."""
+    """R of `_triangle`, columns left as they are."""
+    if is_tall(columns):
+        return tall_triangle(columns)
     if not isinstance(columns, np.ndarray):
         return namespace(columns).linalg.qr(columns)[1]
     from scipy.linalg import qr

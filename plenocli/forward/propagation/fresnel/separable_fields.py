@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from plenocli.base.device import CPU, Device
-from plenocli.forward.propagation.complex_products import THREE_SERVE, product_of_thirds, thirds
+from plenocli.forward.propagation.complex_matrices import THREE_SERVE, product_of_thirds, thirds
 
 WORK_BYTES = 1 << 22
 """Size of the product before it is squared: small beside the shared cache, large enough that the

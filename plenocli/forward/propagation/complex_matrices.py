@@ -18,7 +18,7 @@ from plenocli.base.tiling import spread_bands
 
 THREE_SERVE = 60
 """Rows, columns and terms from which on three real products take less time than four."""
-TALL = 4
+TALL = 12
 """Rows a column from which on bases by Cholesky factors take less time."""
 OVER = 2
 """Rows of the sketch a column: lengths of combinations of columns differ by ten times at the most

@@ -35,6 +35,7 @@ def test_every_stage_draws_under_a_name_of_its_own_and_not_otherwise():
         "random_streams.py",
         "dictionary.py",
         "sweep_file.py",
+        "complex_matrices.py",
         "low_rank_product.py",
     }
 

@@ -14,9 +14,9 @@ from plenocli.forward.accuracy import dial as accuracy
 from plenocli.forward.camera.geometry import geometry
 from plenocli.forward.camera.quadrature import gauss
 from plenocli.forward.propagation.bands import spectral_nodes
+from plenocli.forward.propagation.exact import interval_pairs, term_counts
 from plenocli.forward.propagation.exact import lenslets as exact
 from plenocli.forward.propagation.exact import low_rank_product as product
-from plenocli.forward.propagation.exact import term_counts
 from plenocli.forward.propagation.exact.residual import Residual, ell, kappa, path, split
 from plenocli.forward.propagation.fresnel import separable_fields
 from plenocli.forward.propagation.fresnel.paraxial_error import paraxial_error
@@ -43,6 +43,7 @@ ISOLATED = [(0, 0)]
 NEIGHBOURS = [(r, c) for r in (-1, 0, 1) for c in (-1, 0, 1)]
 ROWS = [0, 4]
 PROFILES = ["hyperbolic", "parabolic"]
+COMA = ({"noll": 8, "coefficient": 60e-9},)
 
 
 def fast_camera(f_number=2.5, **changes):
@@ -238,6 +239,31 @@ def test_functions_that_carry_the_field_bring_what_the_pixels_nodes_do(
         for count in (plan.bands[0].sensor_count, 0)
     )
     assert errors(found, true).max() < 0.3e-7
+
+
+@pytest.mark.parametrize("asked", [1e-3, 1e-6])
+@pytest.mark.parametrize("change", [{}, {"main_lens__aberrations": COMA}], ids=["real", "complex"])
+def test_few_functions_on_a_lenslet_bring_what_all_the_kernel_s_nodes_do(
+    change, asked, monkeypatch
+):
+    camera = fast_camera(1.5, lenslet_array__fill_factor=0.8, **change)
+    counted = []
+    functions = interval_pairs.Interval._functions
+
+    def counting(self, *where):
+        onto, values = functions(self, *where)
+        counted.append((len(onto), onto.shape[1]))
+        return onto, values
+
+    monkeypatch.setattr(interval_pairs.Interval, "_functions", counting)
+    found = columns(camera, range(12), asked=asked)
+    few, counted[:] = counted.copy(), []
+    monkeypatch.setattr(interval_pairs, "SHARE", 0)
+    monkeypatch.setattr(interval_pairs, "psf_nodes", lambda *_: 10**6)
+    true = columns(camera, range(12), asked=asked)
+    assert errors(found, true).max() < 0.05 * asked
+    assert all(count == nodes for nodes, count in counted)
+    assert all(count < 0.8 * nodes for nodes, count in few)
 
 
 @pytest.mark.parametrize("place", [(0, 1), (-1, 1)], ids=str)

@@ -16,7 +16,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -162,7 +162,8 @@ class Interval:
         values = self.terms.evaluate(middle + half * t[:, None] - points, points)
         values = (values * self.side.emphasis[:, None]).transpose(0, 2, 1) * root[:, :, None]
         weighed = (values * self.terms.strength[:, None]).reshape(few, -1)
-        basis, s, _ = np.linalg.svd(np.linalg.qr(weighed.T, mode="r").T, full_matrices=False)
+        triangle: Any = np.linalg.qr(weighed.T, mode="r")
+        basis, s, _ = np.linalg.svd(triangle.T, full_matrices=False)
         basis = basis[:, : terms_within(s, tolerance * math.sqrt(len(points)))]
         kind = self.dtype if np.iscomplexobj(values) else self.dtype.type().real.dtype
         seen = basis.conj().T @ values.reshape(few, -1)

@@ -386,7 +386,7 @@ def _combined(x: Any, order: np.ndarray, signs: np.ndarray, count: int) -> Any:
     xp, rows = namespace(x), len(order)
     whole = -(-rows // count) * count
     signs, order = np.pad(signs, (0, whole - rows)), np.pad(order, (0, whole - rows))
-    total = 0
+    total: Any = 0
     for start in range(0, whole, count):
         some = slice(start, start + count)
         part = xp.take(x, beside(x, order[some]), axis=0)

@@ -190,7 +190,8 @@ def _divided(
 
     spread_bands(rows, ROWS, work)
     # in the order of rows, whoever was first
-    return np.sum([grams[key] for key in sorted(grams)], axis=0)
+    total: Any = sum(grams[key] for key in sorted(grams))
+    return total
 
 
 def _overlaps(real: np.ndarray, imaginary: np.ndarray) -> np.ndarray:

@@ -854,6 +854,19 @@ def test_superpixels_are_set_up_on_threads_with_the_same_bytes():
     np.testing.assert_array_equal(*found)
 
 
+def test_memory_of_large_matrices_is_used_again_where_it_is_large_enough():
+    places, kind = exact._Places(), np.dtype(np.complex64)
+    first = places.take((30, 20), kind)
+    beside = places.take((30, 20), kind)
+    assert first.shape == (30, 20) and not np.shares_memory(first, beside)
+    places.give(first[3:].T)
+    again = places.take((5, 100), np.dtype(complex))
+    assert not np.shares_memory(again, first) and again.dtype == complex
+    places.give(beside)
+    smaller = places.take((7, 3), kind)
+    assert np.shares_memory(smaller, beside) and not np.shares_memory(smaller, again)
+
+
 @pytest.mark.parametrize("nearer", [1.0, 0.97, 0.9])
 def test_errors_of_dim_light_count_no_less_than_it_shows(nearer):
     """Weights of points on superpixels, from the light that enters each lenslet, against the light

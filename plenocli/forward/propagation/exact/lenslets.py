@@ -227,6 +227,8 @@ class _Places:
             fits = [n for n, place in enumerate(self._free) if len(place) >= needed]
             number = min(fits, key=lambda n: len(self._free[n]), default=None)
             place = None if number is None else self._free.pop(number)
+            if place is None:  # those that are too small are not kept beside it
+                self._free.clear()
         place = np.empty(needed, np.uint8) if place is None else place
         return place[:needed].view(dtype).reshape(shape)
 

@@ -226,6 +226,32 @@ def test_captures_of_another_kind_are_refused(files, tmp_path):
     assert not (tmp_path / "o.h5").exists()
 
 
+@pytest.mark.filterwarnings("error")
+def test_light_beyond_any_sensor_is_refused_alone(files, tmp_path, capsys):
+    known = dict(units="DN", black=100.0, exposure_s=0.1)  # no level of saturation
+    white = capture(tmp_path / "white.h5", 1.0, white=None)
+    bands = [
+        (w, capture(tmp_path / f"{w}.h5", np.eye(2)[k], white=None)) for k, w in enumerate(BANDS)
+    ]
+    run_calibrate(tmp_path / "c.h5", whites=[white], bands=bands)
+    shot = read_artefact(files["shots"][0]).data["capture/mosaic"].astype(np.float32)
+    spike = shot.copy()
+    spike[40, 40] = -1e30
+
+    def demux(name, mosaic, **also):
+        data = {"capture/mosaic": mosaic, "capture/cfa": "mono"}
+        write_artefact(tmp_path / name, Artefact("capture", data, {"capture": known | also}))
+        words = ["demux", str(tmp_path / name), "--calibration", str(tmp_path / "c.h5")]
+        return run([*words, "-o", str(tmp_path / "o.h5"), "--overwrite"]), capsys.readouterr().err
+
+    for name, mosaic in (("all.h5", shot * np.float32(1e30)), ("one.h5", spike)):
+        code, said = demux(name, mosaic)
+        assert code == 3 and "times the light of white" in said
+        assert said.count("\n") == 1 and not (tmp_path / "o.h5").exists()
+    code, said = demux("near.h5", shot * np.float32(1e9))
+    assert code == 0 and "no description of the camera" in said
+
+
 def test_names_that_would_collide_and_wrong_suffixes_are_usage_errors(files, tmp_path):
     (tmp_path / "x").mkdir()
     twin = tmp_path / "x" / "shot0.h5"

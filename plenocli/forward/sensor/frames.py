@@ -153,13 +153,15 @@ def require_sensor(
         )
 
 
-def require_in_reach(signal: np.ndarray, path: str | Path | None) -> None:
+def require_in_reach(signal: np.ndarray, path: str | Path | None, brightest: float = 1.0) -> None:
     """InputError for light that is no sensor's, as of a file in another unit.
 
-    signal: of any shape, 1 for white; NaN where unknown.
+    signal: of any shape; NaN where unknown.
     path: of the capture.
+    brightest: white, in the unit of the signal.
     """
     most = max(float(np.fmax.reduce(side, axis=None, initial=0)) for side in (signal, -signal))
+    most /= brightest
     if most > REACH:
         raise InputError(
             f"has pixels of {most:.2g} times the light of white",

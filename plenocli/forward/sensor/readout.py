@@ -10,11 +10,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
 from plenocli.base.tiling import EVERYTHING, Plane
-from plenocli.forward.sensor.frames import SATURATION, Dark
+from plenocli.forward.sensor.frames import SATURATION, Dark, require_in_reach
 from plenocli.forward.sensor.superpixel import inside
 
 BAND = 1 << 21
@@ -33,6 +34,8 @@ class Readout:
     scale: to the light of the calibration's exposure.
     offset: taken off after that.
     ready: windows of the dark image that were cut before.
+    brightest: white, in units of the light; None: all is taken as it is.
+    path: of the capture, for messages.
     """
 
     values: np.ndarray | Plane
@@ -43,6 +46,8 @@ class Readout:
     scale: float = 1.0
     offset: float = 0.0
     ready: DarkWindows | None = None
+    brightest: float | None = None
+    path: str | Path | None = None
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -60,6 +65,7 @@ class Readout:
 
         Returns (lenslet, pixel) float32; NaN where a pixel is saturated, and everywhere in windows
         that are not wholly on the sensor.
+        Raises InputError for light beyond reach.
         """
         return self.cutter(origin, window)(slice(None))
 
@@ -148,6 +154,8 @@ class _Cutter:
             light -= np.float32(readout.offset)
         if raw.max() >= self.least:
             light[raw >= self._of(self.top, origin)] = np.nan
+        if readout.brightest is not None and raw.dtype.kind == "f":
+            require_in_reach(light, readout.path, readout.brightest)
         return light
 
     def _of(self, level: np.ndarray | np.floating, origin: np.ndarray) -> np.ndarray | np.floating:

@@ -85,6 +85,8 @@ def readout(
         white=top,
         scale=scale,
         ready=c.levels,
+        brightest=c.brightest,
+        path=path,
     )
     known = exposure.white_noise
     if known is not None and known.white:

@@ -217,6 +217,11 @@ class LensletResponses:
         return self.common if self.shared else mean_of_known(self.sampled_response)
 
     @cached_property
+    def brightest(self) -> float:
+        """What the brightest pixel of a typical superpixel shows of a white of radiance 1."""
+        return float(np.nansum(np.clip(self.typical, 0, None), axis=1).max()) or 1.0
+
+    @cached_property
     def sampled_pixels(self) -> tuple[np.ndarray, np.ndarray]:
         """`pixels` of the sample."""
         return _pixels(self.sampled_response[None] if self.shared else self.sampled_response)

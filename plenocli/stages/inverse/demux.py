@@ -14,7 +14,7 @@ import numpy as np
 
 from plenocli.base.budget import one_thread
 from plenocli.base.errors import InputError, NumericsError
-from plenocli.base.progress import note
+from plenocli.base.progress import collected_notes, note
 from plenocli.base.text import Record
 from plenocli.base.tiling import FORGETFUL, Keeper
 from plenocli.execution.batch import outcomes, plan_batch, summarise
@@ -325,19 +325,21 @@ class CaptureDemultiplexer:
         )
         only = None if several else next(iter(targets.items()))
         self.keeper: Keeper = FORGETFUL if only is None else self._keeper(*only, found)
-        self.solver = Demultiplexer(
-            found,
-            method=settings.method,
-            register=settings.register,
-            ratio=settings.reference is not None,
-            camera=described if settings.camera is None else read_camera(settings.camera),
-            known=None
-            if settings.prior is None
-            else read_labelled(settings.prior, there(found.response).wavelengths),
-            threads=threads,
-            several=several or settings.reference is not None,
-            keeper=self.keeper,
-        )
+        # remarks on results, told with the first of them: a refusal comes alone
+        with collected_notes() as self.remarks:
+            self.solver = Demultiplexer(
+                found,
+                method=settings.method,
+                register=settings.register,
+                ratio=settings.reference is not None,
+                camera=described if settings.camera is None else read_camera(settings.camera),
+                known=None
+                if settings.prior is None
+                else read_labelled(settings.prior, there(found.response).wavelengths),
+                threads=threads,
+                several=several or settings.reference is not None,
+                keeper=self.keeper,
+            )
         self.reference: Spectra | None = None
         if settings.reference is not None:
             self.reference = self.demux(settings.reference, self._method_of_reference())[0]
@@ -402,6 +404,8 @@ class CaptureDemultiplexer:
             overwrite=self.overwrite,
         )
         clear(Path(target))
+        while self.remarks:
+            note(self.remarks.pop(0))
         return _capture_summary(found, capture, target)
 
 

@@ -11,6 +11,7 @@ import tifffile
 import plenocli.stages.inverse.reconstruct.one_capture as one_capture
 from plenocli.base.budget import Budget, within
 from plenocli.base.tiling import Plane
+from plenocli.cli.main import run
 from plenocli.files.artefacts.provenance import Provenance
 from plenocli.files.artefacts.reading import Stored, read_artefact
 from plenocli.files.images.dng import write_dng
@@ -111,3 +112,22 @@ def test_bands_of_a_capture_in_a_file_give_each_lenslet_its_own_share(
         rgb = np.tensordot(held.profile.to_rgb, own, axes=1)
         np.testing.assert_allclose(whole["image/rgb"], rgb, rtol=1e-5)
     assert [path.name for path in tmp_path.iterdir()] == ["o.h5"]
+
+
+@pytest.mark.parametrize(
+    "name, value, says",
+    [("black", 100.0, "no light"), ("zero", 0, "no light"), ("burnt", 4095, "100.00% of the")],
+)
+def test_a_capture_that_shows_nothing_is_told_in_a_line(
+    made, tmp_path, monkeypatch, capsys, name, value, says
+):
+    """By the picture of a calibrated camera, and by its planes."""
+    monkeypatch.chdir(tmp_path)
+    noise = np.random.default_rng(4).normal(0, 2, SHAPE)
+    tifffile.imwrite("shot.tif", np.clip(value + noise, 0, 4095).astype(np.uint16))
+    for command in (["reconstruct", "--method", "block-mean"], ["refocus"]):
+        calibration = str(made[0] / "mono.h5")
+        said = [*command, "shot.tif", "--calibration", calibration, "-o", f"{command[0]}.h5"]
+        assert run(said) == 0
+        told = [line for line in capsys.readouterr().err.splitlines() if "warning" in line]
+        assert len(told) == 1 and says in told[0]

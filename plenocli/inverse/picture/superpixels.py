@@ -208,7 +208,7 @@ class AlongTheGrid:
             y = np.where(known, signal, np.nan) * (scale[:, :, None] / falls)
             self._y[own, :] = y.reshape(-1, self.pixels)
             if self._clipped is not None:
-                self._clipped[own, :] = _clipped(capture, calibration, some)
+                self._clipped[own, :] = clipped_windows(capture, calibration, some)
         away = float(np.sqrt(np.average(off / np.prod(self.count), weights=even)))
         if away > TOLD:
             note(
@@ -253,7 +253,7 @@ def _brightness(white: np.ndarray, even: np.ndarray, known: np.ndarray) -> np.nd
     return np.divide(expected, light, out=np.zeros_like(light), where=light > 0)
 
 
-def _clipped(capture: Capture, calibration: Calibration, rows: slice) -> np.ndarray:
+def clipped_windows(capture: Capture, calibration: Calibration, rows: slice) -> np.ndarray:
     """Which pixels of the windows of some rows of lenslets are saturated, (lenslet, pixel)."""
     windows, white = there(calibration.windows), _white_level(capture, calibration)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -13,12 +13,15 @@ import numpy as np
 from plenocli.base.budget import one_thread
 from plenocli.base.errors import UsageError
 from plenocli.base.text import Record
+from plenocli.base.tiling import EVERYTHING, Plane
 from plenocli.execution.batch import outcomes, plan_batch, summarise
 from plenocli.execution.pool import open_pool
 
 if TYPE_CHECKING:
     from plenocli.execution.batch import BatchSummary
     from plenocli.files.bench import Bench
+    from plenocli.forward.sensor.capture import Capture
+    from plenocli.forward.sensor.light_meter import Light
     from plenocli.inverse.lightfield.optics import MicroscopeOptics, Optics
     from plenocli.inverse.lightfield.planes import DepthMap, LightField
     from plenocli.inverse.lightfield.samples import SampleBands
@@ -155,7 +158,7 @@ def _refocused(
     from plenocli.inverse.lightfield.light_field import refocused
 
     target = targets[capture]
-    source = _source(capture, settings.calibration, target)
+    source, light = _source(capture, settings.calibration, target)
     inputs = describe_inputs(
         {"capture": capture, "calibration": settings.calibration, "camera": settings.camera}
     )
@@ -171,6 +174,8 @@ def _refocused(
         room=Scratch(target, bench),
         keeper=bench or FORGETFUL,
     )
+    if light is not None:
+        light.tell(capture.name)
     return _Refocused(field=field, source=source, inputs=inputs)
 
 
@@ -230,13 +235,18 @@ def _write(
     )
 
 
-def _source(capture: Path, calibration: Path | None, target: Path) -> SampleBands:
-    """Samples of a capture, or of spectra that demux made of one, on the way to `target`."""
+def _source(
+    capture: Path, calibration: Path | None, target: Path
+) -> tuple[SampleBands, Light | None]:
+    """Samples of a capture and the light on its pixels, or those of spectra that demux made of one,
+    on the way to `target`.
+    """
     from plenocli.files.images.mosaic import capture_in_file
     from plenocli.files.opened_file import open_file
     from plenocli.files.read.calibrations import read_calibration, read_images
     from plenocli.files.results.results import read_result
     from plenocli.files.scratch import Scratch
+    from plenocli.forward.sensor.light_meter import Light
     from plenocli.inverse.lightfield.gather import bands_of, samples_of_spectra
     from plenocli.inverse.lightfield.samples import SampleBands
 
@@ -251,12 +261,30 @@ def _source(capture: Path, calibration: Path | None, target: Path) -> SampleBand
         spectra = read_result(capture, ("spectra",))
         assert spectra.wavelengths is not None
         known = read_calibration(calibration)
-        return SampleBands.of(
-            *samples_of_spectra(spectra.values, spectra.wavelengths, known, where=calibration)
-        )
-    found = None if calibration is None else read_images(calibration)
+        found = samples_of_spectra(spectra.values, spectra.wavelengths, known, where=calibration)
+        return SampleBands.of(*found), None
+    images = None if calibration is None else read_images(calibration)
     shot = capture_in_file(capture, small=False, room=Scratch(target))
-    return bands_of(shot, found, where=calibration)
+    samples = bands_of(shot, images, where=calibration)
+    dark = None if images is None else images.dark
+    white = min(shot.levels.white, np.inf if images is None else images.sensor.white_level)
+    return samples, Light.of(_seen(shot, None if dark is None else Plane.of(dark.mean), white))
+
+
+def _seen(
+    shot: Capture, dark: Plane | None, white: float
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Light of some rows of a capture after the other, and which of their pixels are saturated.
+
+    dark: what the sensor reports without light, None: its black level.
+    white: where the sensor saturates.
+    """
+    from plenocli.forward.sensor.frames import saturated
+
+    for rows in Plane.of(shot.mosaic).in_bands(2):  # levels go by the parity of rows
+        part = shot.window(rows, EVERYTHING)
+        light = part.signal() if dark is None else part.mosaic - dark.read(rows, EVERYTHING)
+        yield light, saturated(part.mosaic, part.levels.black, white)
 
 
 def _told(depth: DepthMap | None, slopes: np.ndarray) -> tuple[float | None, float | None]:

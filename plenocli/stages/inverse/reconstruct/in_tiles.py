@@ -17,6 +17,7 @@ from plenocli.base.progress import bar, collected_notes
 from plenocli.execution.pool import Pool, run_all
 from plenocli.files.artefacts.provenance import file_digest
 from plenocli.files.read.captures import describe_capture, superpixel_source
+from plenocli.forward.sensor.light_meter import Light
 from plenocli.inverse.picture.diagnosis import Seen
 from plenocli.inverse.picture.estimate import estimate
 from plenocli.inverse.picture.estimators import Estimators
@@ -149,6 +150,7 @@ class _Typical:
             lambda: survey(system, source, side_of(system)), about_capture
         )
         data = source.cut(*middle.own)
+        Light.of([(data.y, None)]).tell(capture.name)
         matrix, limits = matrix_that_serves(recipe, matrix, data)
         estimators, off = estimators_by(recipe, matrix), error_that_counts(limits)
         declared = data.saturated is not None

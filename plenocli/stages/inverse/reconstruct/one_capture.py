@@ -17,13 +17,14 @@ from plenocli.execution.pool import InProcess, Pool
 from plenocli.files.read.calibrations import read_white
 from plenocli.files.read.captures import describe_capture, room_beside
 from plenocli.forward.sensor.cfa import cfa_map
+from plenocli.forward.sensor.light_meter import Light
 from plenocli.forward.sensor.superpixel import extract_rows
 from plenocli.inverse.calibration.calibration import Windows, there
 from plenocli.inverse.picture.estimate import estimate
 from plenocli.inverse.picture.footprint import require_reconstruction
 from plenocli.inverse.picture.methods.registry import METHODS
 from plenocli.inverse.picture.reconstruction import Choice, Reconstruction
-from plenocli.inverse.picture.superpixels import windows_of
+from plenocli.inverse.picture.superpixels import clipped_windows, windows_of
 from plenocli.inverse.picture.tiles import (
     EVERY,
     tiles_of,
@@ -83,6 +84,7 @@ def reconstruct_capture(
     if len(tiles) > 1:
         return picture_in_tiles(recipe, capture, source, tiles, tasks, where)
     data = source.cut(*EVERY)
+    Light.of([(data.y, None)]).tell(capture.name)
     require_reconstruction(
         estimators,
         data.y.shape[0] * data.y.shape[1],
@@ -137,8 +139,11 @@ def _white_normalised(
     rgb_too = shot.cfa != "mono" and not set("RGB") - set(shot.cfa)
     count, pixels = known.grid.valid.shape, int(np.prod(there(known.windows).shape))
     values, colours = [], []
-    for rows in bands(count[0], BAND // (pixels * count[1])):
+    parts = bands(count[0], BAND // (pixels * count[1]))
+    for rows in parts:
         signal, white = windows_of(shot, known, rows)
+        if rows == parts[len(parts) // 2]:  # what is wrong with all of it is wrong in the middle
+            Light.of([(signal, clipped_windows(shot, known, rows))]).tell(capture.name)
         usable = np.isfinite(signal) & np.isfinite(white)
         values.append(_share(signal, white, usable))
         lit = (_of_colour(shot, there(known.windows), rows, n) for n in ("RGB" if rgb_too else ""))

@@ -2,6 +2,7 @@ import json
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from plenocli.base import progress
 from plenocli.base.errors import InputError, UsageError
@@ -85,6 +86,16 @@ def test_a_perfect_result_gives_null_and_not_infinity(picture):
     document = run_score([result], folder / "p.json", truth=same)
     assert document.figures["psnr_db"] is None and document.figures["rmse"] == 0
     assert "Infinity" not in (folder / "p.json").read_text()
+
+
+@pytest.mark.parametrize("level, side", [(0.0, 12), (0.5, 12), (1.0, 1)])
+def test_a_truth_without_detail_is_told(picture, capsys, level, side):
+    """A photograph of one pixel is as even as a black one of the result's size."""
+    folder, _, good, *_ = picture
+    Image.fromarray(np.full((side, side), 255 * level, "u1")).save(folder / "even.png")
+    run_score([good], folder / "s.json", truth=folder / "even.png")
+    told = [line for line in capsys.readouterr().err.splitlines() if "warning" in line]
+    assert len(told) == 1 and "even.png" in told[0] and "everywhere" in told[0]
 
 
 def test_only_the_metrics_asked_for(picture):

@@ -37,7 +37,7 @@ def test_neither_light_nor_detail():
 
 @pytest.mark.parametrize("seed", range(20))
 def test_faint_light_counts(seed):
-    """A fifth of the noise is 13 standard errors of 4,200 pixels; noise alone does not reach five."""
+    """A fifth of the noise is 13 standard errors of 4,200 pixels, noise alone less than five."""
     assert told(0.6 + noise(seed)) == ""
     assert told(noise(seed)) != ""
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from plenocli.base.errors import InputError, UsageError
+from plenocli.base.progress import note
 from plenocli.base.text import json_value
 from plenocli.base.tiling import Plane
 from plenocli.evaluation.metrics.figures import figures
@@ -120,7 +121,22 @@ def _score_picture(
             )
         return values
 
-    return score_picture(result.plane.through(sound), truth.through(sound), block, result.deviation)
+    lowest, highest = np.inf, -np.inf
+
+    def watched(values: np.ndarray) -> np.ndarray:
+        nonlocal lowest, highest
+        lowest, highest = values.min(initial=lowest), values.max(initial=highest)
+        return sound(values)
+
+    score = score_picture(
+        result.plane.through(sound), truth.through(watched), block, result.deviation
+    )
+    if lowest == highest:
+        note(
+            f"warning: {comparison.truth}: is {lowest:.4g} everywhere on the result's grid: figures "
+            "tell how near the result comes to that, and nothing of detail"
+        )
+    return score
 
 
 def _require_values(truth: Plane, where: Path | str | None) -> None:

@@ -73,6 +73,14 @@ def test_a_file_that_is_not_what_its_name_says_is_no_raw_file(tmp_path, name, ki
         read_capture(tmp_path / name)
 
 
+@pytest.mark.parametrize("name", ["a.png", "a.exr", "a.JPG"])
+def test_a_tiff_of_another_name_is_no_raw_file(tmp_path, name):
+    """Nor a picture: a camera's RAW is a TIFF, too, whose first picture is a thumbnail."""
+    save(tmp_path / "a.tif", numbers((16, 16), np.uint16)).rename(tmp_path / name)
+    with pytest.raises(InputError, match="file does, but as a TIFF; name it .tif"):
+        read_capture(tmp_path / name)
+
+
 def test_capture_as_artefact_and_as_exr_says_the_same(tmp_path):
     values = numbers((6, 8), np.uint16)
     capture = Capture(

@@ -23,6 +23,12 @@ def test_pixels_are_left_out_and_told(tmp_path, monkeypatch, capsys):
     for one in told["held_out"]:
         assert one["model"] < min(one["neighbours"], one["neighbours_over_white"])
         assert one["model"] < one["block_mean"]
+    # the line for a person has the widest patches alone
+    widest = told["held_out"][-1]
+    assert (
+        "patches of 4 x 4 pixels in lenslets that show something predicted within " in told["rule"]
+    )
+    assert f"{widest['model']:.2%} of white" in told["rule"] and len(told["rule"]) < 300
     data = read_artefact(tmp_path / "picture.h5", ("image",)).data
     assert run([*command, "--method", "block-mean", "-o", "block.h5"]) == 0
     block = read_artefact(tmp_path / "block.h5", ("image",)).data["image/value"]

@@ -36,7 +36,15 @@ if TYPE_CHECKING:
 CAPTURE = "plenocli:capture"  # EXR attribute: JSON of what a capture artefact has as attributes
 MOSAIC = "capture/mosaic"
 _CFA = re.compile(r"mono|[RGB]{4}")
-NAMED = {".h5": "HDF5", ".png": "PNG", ".tif": "TIFF", ".tiff": "TIFF", ".exr": "OpenEXR"}
+NAMED = {
+    ".h5": "HDF5",
+    ".png": "PNG",
+    ".jpg": "JPEG",
+    ".jpeg": "JPEG",
+    ".tif": "TIFF",
+    ".tiff": "TIFF",
+    ".exr": "OpenEXR",
+}
 """Suffix -> what LibRaw need not be asked about."""
 
 
@@ -75,11 +83,14 @@ def _read(path: Path, cfa: str | None, room: Room | None) -> Capture:
         found = _contained(path, read_lytro(path, room))
     elif path.suffix.lower() in BIO:
         found = _of_values(path, read_bio(path, room), cfa or "mono")
-    elif kind is None and path.suffix.lower() in NAMED:
+    elif kind in (None, "tiff") and path.suffix.lower() in NAMED:
+        is_tiff = kind == "tiff"  # RAW files are TIFFs, too, and only their names say so
         raise InputError(
-            f"begins as no {NAMED[path.suffix.lower()]} file does",
+            f"begins as no {NAMED[path.suffix.lower()]} file does"
+            + (", but as a TIFF" if is_tiff else ""),
             path,
-            "make or copy it again; a RAW file keeps its own suffix",
+            f"{'name it .tif' if is_tiff else 'make or copy it again'}; a RAW file keeps its own "
+            "suffix",
         )
     else:
         is_dng = kind == "tiff" and path.suffix.lower() == ".dng"

@@ -57,12 +57,11 @@ class HeldOut(Record):
     @property
     def sentence(self) -> str:
         """For a person."""
-        which = "of lenslets that show something" if self.structured else "of all lenslets"
+        which = "in lenslets that show something" if self.structured else "in all lenslets"
         return (
-            f"{self.pixels} pixels {which} left out in patches of {self.patch} x {self.patch}: "
-            f"predicted within {self.model:.2%} of white (noise {self.noise:.2%}), with what is "
-            f"left over around {self.both:.2%}; from the pixels around {self.neighbours:.2%}, over "
-            f"white {self.neighbours_over_white:.2%}; block mean {self.block_mean:.2%}"
+            f"patches of {self.patch} x {self.patch} pixels {which} predicted within "
+            f"{self.model:.2%} of white (noise {self.noise:.2%}), by the pixels around over white "
+            f"{self.neighbours_over_white:.2%}"
         )
 
 

@@ -52,9 +52,9 @@ class WeightedStats:
 
     @property
     def rule(self) -> str:
-        """In words."""
+        """In words, of pixels that were left out the widest patches, which tell the most."""
         left = f"every pixel with its own noise, of which {self.misfit:.2f} times is left over"
-        return "; ".join([left, *(one.sentence for one in self.held_out)])
+        return "; ".join([left, *(one.sentence for one in self.held_out[-1:])])
 
     def as_json(self) -> dict[str, Any]:
         """Names and values, as artefacts hold them."""

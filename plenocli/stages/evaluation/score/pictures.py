@@ -133,8 +133,8 @@ def _score_picture(
     )
     if lowest == highest:
         note(
-            f"warning: {comparison.truth}: is {lowest:.4g} everywhere on the result's grid: figures "
-            "tell how near the result comes to that, and nothing of detail"
+            f"warning: {comparison.truth}: is {lowest:.4g} everywhere on the result's grid: "
+            "figures tell how near the result comes to that, and nothing of detail"
         )
     return score
 

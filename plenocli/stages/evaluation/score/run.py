@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from plenocli.base.errors import InputError, PlenoError, UsageError
-from plenocli.base.progress import tell
+from plenocli.base.progress import repeats_counted, tell
 from plenocli.base.tiling import Plane
 from plenocli.evaluation.chosen import definitions_of, keep_chosen
 from plenocli.evaluation.metrics.figures import figures
@@ -227,7 +227,8 @@ def _score_all(
     """Every result scored, set against single pixel and reduced to what was asked for; a single
     one raises its error.
     """
-    scored = [_attempt(path, comparison, len(results) == 1) for path in results]
+    with repeats_counted():
+        scored = [_attempt(path, comparison, len(results) == 1) for path in results]
     singles = [one for one in scored if one.score.method == SINGLE and not one.score.error]
     single = singles[0].spectra if len(singles) == 1 else None
     if single is not None:

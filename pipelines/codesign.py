@@ -126,6 +126,19 @@ def draw(run: Path, captured: dict[str, list[dict[str, str]]]) -> None:
     (run / "codesign.png").write_bytes(made.png)
 
 
+def lines(captured: list[dict[str, str]]) -> list[str]:
+    """A table of the designs that were captured, within 100 characters."""
+    keys = (EXPOSURE, "filter_array.layout", "filter_array.filters.*.fwhm")
+    figures = (ACCURACY, "class_accuracy", "class_accuracy_low", "class_accuracy_high")
+    rows = [("exposure", "layout", "width", "method", "learnt", "expected", "told", "low", "high")]
+    for row in captured:
+        how = [row.get(key, "") for key in (*keys, "demux.method", "score.learnt")]
+        shown = [f"{float(row[c]):.3f}" if row.get(c) else "-" for c in figures]
+        rows.append((*how, *shown))
+    widths = [max(map(len, column)) for column in zip(*rows)]
+    return ["  " + "  ".join(c.rjust(w) for c, w in zip(row, widths)) for row in rows]
+
+
 def main() -> None:
     """Both searches, captures of their fronts, the picture and the table."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -142,15 +155,9 @@ def main() -> None:
         plenocli("optimise", SWEEPS / f"{name}.toml", "-o", table, *words)
         captured[name] = capture(name, asked.run, asked.designs, asked.workers)
     draw(asked.run, captured)
-    columns = [ACCURACY, "class_accuracy", "class_accuracy_low", "class_accuracy_high"]
-    columns += ["psnr_db", "six_patch_rmse", "spectral_angle_deg", "snr_predicted_mean_db"]
-    columns += ["electrons_per_pixel", "matrix_seconds", "matrix_bytes"]
     for name, label in SEARCHES.items():
-        print(f"{label}: exposure, layout, width, processing, {', '.join(columns)}")
-        for row in captured[name]:
-            keys = (EXPOSURE, "filter_array.layout", "filter_array.filters.*.fwhm")
-            how = [row.get(key, "") for key in (*keys, "demux.method", "score.learnt")]
-            print("  ", *how, *(f"{float(row[c]):.4g}" if row.get(c) else "-" for c in columns))
+        print(f"{label}; all figures in {asked.run / f'{name}_captured.csv'}")
+        print("\n".join(lines(captured[name])))
 
 
 if __name__ == "__main__":

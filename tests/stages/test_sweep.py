@@ -23,7 +23,7 @@ from plenocli.stages.sweep import task as chain
 from plenocli.stages.sweep.point import run_point
 from plenocli.stages.sweep.space import open_space
 from plenocli.stages.sweep.sweep import run_sweep
-from plenocli.stages.sweep.table import lines, objectives_of
+from plenocli.stages.sweep.table import MOST_SHOWN, SweepSummary, lines, objectives_of
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -185,6 +185,33 @@ def test_the_front_is_what_brute_force_finds(whole):
     )
     assert np.flatnonzero(read_artefact(table, "sweep").data["sweep/front"]).tolist() == expected
     assert f"{len(expected)} on the front of psnr_db max, sensor_pixels min" in lines(report)
+
+
+def test_the_front_is_shown_within_a_line_of_a_terminal():
+    """Number and objectives, then what fits; the rest is counted, and stands in the .csv."""
+    keys = [f"filter_array.filters.{n}.center" for n in range(16)] + ["sensor.exposure"]
+    front = [
+        {"point": n, "class_accuracy_expected": n / 7, **dict.fromkeys(keys, f"{n} ms")}
+        for n in range(MOST_SHOWN + 3)
+    ]
+    aims = {"class_accuracy_expected": "max", "sensor.exposure": "min"}
+    report = SweepSummary(
+        output="runs/a.h5",
+        points=99,
+        computed=99,
+        refused=0,
+        with_remarks=0,
+        first_reason="",
+        first_remark="",
+        objectives=aims,
+        front=front,
+        cpu_seconds=1.0,
+    )
+    _, head, *rows, more = lines(report).splitlines()
+    assert head.split()[:3] == ["point", *aims] and len(rows) == MOST_SHOWN
+    assert 60 < max(map(len, [head, *rows])) <= 100
+    hidden = len(keys) + 2 - len(head.split())
+    assert more == f"  {hidden} columns and 3 rows more in runs/a.csv"
 
 
 def test_what_is_shared_is_computed_once(whole, tmp_path, monkeypatch):

@@ -10,13 +10,14 @@ import json
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from plenocli.base.errors import ConfigError, InputError, NumericsError
 from plenocli.base.progress import note
-from plenocli.base.text import json_value
+from plenocli.base.text import counted, json_value
 from plenocli.evaluation.designs import DesignTable, Metric, Parameter
 from plenocli.files.results.measured_seconds import measured_path
 from plenocli.stages.sweep.store import SHARED
@@ -35,8 +36,8 @@ FRONTS = {
     "volume": {"volume_snr_db": "max", "object_points": "max"},
 }
 """What counts as better where the file does not say."""
-MOST_SHOWN = 20
-"""Rows of the front that people are shown."""
+MOST_SHOWN, WIDTH = 20, 100
+"""Rows of the front that people are shown, and characters of a row."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -355,16 +356,25 @@ def lines(report: SweepSummary) -> str:
         if count:
             text.append(f"  {count} {what}, the first: {' '.join(said.split())[:200]}")
     if report.front:
-        heads = list(report.front[0])
-        cells = [heads] + [
-            [
-                f"{v:.6g}" if isinstance(v, float) else str(v)
-                for v in (entry.get(h, "") for h in heads)
-            ]
-            for entry in report.front[:MOST_SHOWN]
-        ]
-        widths = [max(len(row[i]) for row in cells) for i in range(len(heads))]
-        text += ["  " + "  ".join(c.rjust(w) for c, w in zip(row, widths)) for row in cells]
-        if len(report.front) > MOST_SHOWN:
-            text.append(f"  and {len(report.front) - MOST_SHOWN} more")
+        text += _front_lines(report)
     return "\n".join(text)
+
+
+def _front_lines(report: SweepSummary) -> list[str]:
+    """The front as a table: number and objectives, and of the other columns those that fit."""
+    first = ["point", *report.objectives]
+    heads = [*first, *(name for name in report.front[0] if name not in first)]
+    columns, width = [], 0
+    for head in heads:
+        values = (entry.get(head, "") for entry in report.front[:MOST_SHOWN])
+        cells = [head, *(f"{v:.6g}" if isinstance(v, float) else str(v) for v in values)]
+        wide = 2 + max(map(len, cells))
+        if head in first or width + wide <= WIDTH:
+            columns.append([cell.rjust(wide) for cell in cells])
+            width += wide
+    text = ["".join(row) for row in zip(*columns)]
+    hidden = len(heads) - len(columns), len(report.front) - MOST_SHOWN
+    more = [counted(n, what) for n, what in zip(hidden, ("column", "row")) if n > 0]
+    if more:
+        text.append(f"  {' and '.join(more)} more in {Path(report.output).with_suffix('.csv')}")
+    return text

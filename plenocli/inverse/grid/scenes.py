@@ -15,6 +15,8 @@ SCALES = (4, 8, 16, 32, 64)
 """px of Gaussians that take the scene off before repeats are looked for."""
 AGREE = 0.03
 """By which the pitch of another scale or direction may differ."""
+AROUND = 4
+"""Times such a scale, over which the contrast of what is left is told."""
 DARK = 0.02
 """Of the usual light, which is no light."""
 HALF = 0.5
@@ -159,16 +161,19 @@ def _period(pictures: Sequence[np.ndarray]) -> lattice.Periodicity:
     """
     from scipy.ndimage import gaussian_filter
 
-    found, reason = [], "no period is the same at two scales and in two directions"
-    for picture in pictures:
+    found: list[tuple[int, lattice.Periodicity]] = []
+    reason = "no period is the same at two scales and in two directions"
+    for number, picture in enumerate(pictures):
         part = np.maximum(white_image.brightest_crop(picture, 1024), 0)
         logarithm = np.log(part + DARK * part.mean())
         for scale in SCALES:
-            seen = lattice.find_basis(logarithm - gaussian_filter(logarithm, scale))
+            detail = logarithm - gaussian_filter(logarithm, scale)
+            contrast = np.sqrt(gaussian_filter(detail**2, AROUND * scale))
+            seen = lattice.find_basis(detail, contrast)
             if seen.basis is not None and np.ptp(np.hypot(*seen.basis.T)) < AGREE * _pitch(seen):
-                found.append(seen)
-    for best in sorted(found, key=lambda one: -one.strength):
-        alike = [one for one in found if abs(_pitch(one) - _pitch(best)) < AGREE * _pitch(best)]
-        if len(alike) > len(pictures):
+                found.append((number, seen))
+    for _, best in sorted(found, key=lambda one: -one[1].strength):
+        alike = [n for n, one in found if abs(_pitch(one) / _pitch(best) - 1) < AGREE]
+        if len(alike) > len(set(alike)):  # one picture at two scales, whatever others show
             return best
     raise NumericsError(f"no lenslet lattice in the capture: {reason}", fix=white_image.FIX)

@@ -5,6 +5,7 @@ by textures at depths, gradients, periodic patterns and black parts.
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
+from skimage import data
 
 from plenocli.base.errors import NumericsError
 from plenocli.inverse.grid.detect import find_grid
@@ -102,6 +103,23 @@ def test_grids_of_scenes_are_as_sure_as_they_say(number, kind):
 def test_grids_of_many_scenes(kind, lattice):
     for seed in range(1, 6):
         check_a_grid(kind, lattice, seed, (0.0, 0.4, 0.8, 1.2, -0.8)[seed - 1])
+
+
+def test_black_parts_of_a_plain_scene_hide_no_lattice():
+    """One brightness a lenslet, four parts of a superpixel, a third of it black: lags from one
+    bright part to another went for the lattice. Captures of nothing beside it change nothing.
+    """
+    rng = np.random.default_rng(7)
+    side = np.repeat([0, 1, 0.4, 1, 0], [1, 8, 2, 8, 1])
+    cell = np.minimum.outer(side, side)
+    lenslets = data.camera()[16:496, :480].reshape(20, 24, 16, 30).mean(axis=(1, 3)) / 255
+    mean = 1600 * np.kron(np.clip(lenslets - 0.08, 0, None), cell) + 4
+    shots = [rng.poisson(one).astype(np.float32) for one in (mean, 0 * mean + 4, 0 * mean + 4)]
+    centres = 20 * np.stack(np.indices(lenslets.shape), -1).reshape(-1, 2) + 9.5
+    for captures in (shots[:1], shots):
+        grid = find_scene_grid(captures, parts=True)
+        assert grid.valid.sum() > 0.9 * lenslets.size
+        assert miss(grid, centres) < 2.5 * grid.expected_error + 0.03
 
 
 def test_several_captures_are_surer_than_one():

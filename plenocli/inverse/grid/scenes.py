@@ -15,8 +15,8 @@ SCALES = (4, 8, 16, 32, 64)
 """px of Gaussians that take the scene off before repeats are looked for."""
 AGREE = 0.03
 """By which the pitch of another scale or direction may differ."""
-AROUND = 4
-"""Times such a scale, over which the contrast of what is left is told."""
+AROUND = 8
+"""Times such a scale: side of the squares over which the contrast of what is left is told."""
 DARK = 0.02
 """Of the usual light, which is no light."""
 HALF = 0.5
@@ -159,7 +159,7 @@ def _period(pictures: Sequence[np.ndarray]) -> lattice.Periodicity:
     """The period that stands out most where slow changes of brightness are taken off, and does so
     at two scales at least; as long in one direction as in the other, which a scene's is not.
     """
-    from scipy.ndimage import gaussian_filter
+    from scipy.ndimage import gaussian_filter, uniform_filter
 
     found: list[tuple[int, lattice.Periodicity]] = []
     reason = "no period is the same at two scales and in two directions"
@@ -168,8 +168,8 @@ def _period(pictures: Sequence[np.ndarray]) -> lattice.Periodicity:
         logarithm = np.log(part + DARK * part.mean())
         for scale in SCALES:
             detail = logarithm - gaussian_filter(logarithm, scale)
-            contrast = np.sqrt(gaussian_filter(detail**2, AROUND * scale))
-            seen = lattice.find_basis(detail, contrast)
+            power = uniform_filter(uniform_filter(detail**2, AROUND * scale), AROUND * scale)
+            seen = lattice.find_basis(detail, np.sqrt(np.maximum(power, 0)))
             if seen.basis is not None and np.ptp(np.hypot(*seen.basis.T)) < AGREE * _pitch(seen):
                 found.append((number, seen))
     for _, best in sorted(found, key=lambda one: -one[1].strength):

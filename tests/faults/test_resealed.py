@@ -119,6 +119,7 @@ IMPOSSIBLE = [
     ("dictionary.h5", BY_DICTIONARY, attribute("dictionary", "parameters", "{}")),
     ("dictionary.h5", BY_DICTIONARY, attribute("dictionary", "parameters", "[]")),
     ("dictionary.h5", BY_DICTIONARY, values("dictionary/atoms", lambda v: v * 0 + 1e300)),
+    ("dictionary.h5", BY_DICTIONARY, values("dictionary/atoms", lambda v: v * 0)),
     ("dictionary.h5", BY_DICTIONARY, attribute("dictionary", "lambda", -1.0)),
     ("dictionary.h5", BY_DICTIONARY, other("dictionary/atoms", lambda v: v[:, :1])),
     ("image.h5", SCORE, values("image/value", lambda v: v * 0 + 1e300)),

@@ -10,6 +10,9 @@ from plenocli.base.progress import note
 from plenocli.inverse.picture.lenslet_model import LensletMatrix
 from plenocli.inverse.sparse.dictionary import Dictionary, Settings, State
 
+UNIT = 1e-3
+"""By which the norm of an atom may differ from 1."""
+
 
 def read_dictionary(path: Path, system: LensletMatrix) -> Dictionary:
     """The dictionary of an artefact, to be used with a system matrix; a note where it was learnt
@@ -18,7 +21,8 @@ def read_dictionary(path: Path, system: LensletMatrix) -> Dictionary:
     path: of the dictionary artefact.
     system: the matrix that captures are explained by.
 
-    Raises InputError where the atoms have another number of points than the matrix, or are one.
+    Raises InputError where the atoms have another number of points than the matrix, are one,
+        or have another norm than 1.
     """
     from plenocli.files.artefacts.provenance import file_digest
     from plenocli.files.artefacts.reading import read_artefact
@@ -36,6 +40,8 @@ def read_dictionary(path: Path, system: LensletMatrix) -> Dictionary:
         )
     if atoms.shape[1] < 2:  # the first is even, for brightness
         raise InputError("has no atom but one", path, "learn more --atoms")
+    if not np.allclose(np.linalg.norm(atoms, axis=0), 1, atol=UNIT):
+        raise InputError("has atoms that are not of unit norm", path, "learn it again")
     if artefact.provenance.inputs.get("pif", {}).get("sha256") != file_digest(system.path):
         note(f"the dictionary was learnt for another system matrix than {system.path.name}")
     try:

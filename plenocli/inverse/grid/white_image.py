@@ -6,7 +6,7 @@ import numpy as np
 
 from plenocli.base.errors import InputError, NumericsError
 from plenocli.base.text import by
-from plenocli.forward.sensor.frames import dead_pixels, shifted_neighbours
+from plenocli.forward.sensor.frames import REACH, dead_pixels, shifted_neighbours
 from plenocli.inverse.grid import lattice
 from plenocli.inverse.grid.lattice import Periodicity
 
@@ -41,6 +41,12 @@ def prepare(
         image -= np.asarray(dark, np.float32)
     if not np.isfinite(image).all():
         raise InputError("the white image holds values that are not finite")
+    if np.abs(image).max() > REACH:
+        raise InputError(
+            f"the white image, or what is taken off it, holds {np.abs(image).max():.2g}: no sensor "
+            "counts so far",
+            fix="give it, and the dark image, as the sensor counts",
+        )
     if np.ptp(image) <= 0:
         raise NumericsError(
             f"no lenslet lattice in the image: every pixel has the value {float(white.flat[0]):g}",

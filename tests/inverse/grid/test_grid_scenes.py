@@ -7,7 +7,7 @@ import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
 from skimage import data
 
-from plenocli.base.errors import NumericsError
+from plenocli.base.errors import InputError, NumericsError
 from plenocli.inverse.grid.detect import find_grid
 from plenocli.inverse.grid.scenes import find_scene_grid, moved_grid
 
@@ -132,6 +132,15 @@ def test_several_captures_are_surer_than_one():
     one, all_of = find_scene_grid(images[:1]), find_scene_grid(images)
     assert all_of.expected_error < one.expected_error
     assert miss(all_of, centres) < max(0.05, 2.5 * all_of.expected_error)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("level", [1e30, -1e30])
+def test_light_of_no_sensor_is_refused_before_squares_overflow(level):
+    image, _ = capture(np.random.default_rng(1), np.ones((150, 150)))
+    for find in (find_grid, lambda one: find_scene_grid([one])):
+        with pytest.raises(InputError, match="no sensor counts so far"):
+            find(image * np.float32(level))
 
 
 def test_what_is_no_light_field_is_refused():

@@ -248,6 +248,9 @@ def test_light_beyond_any_sensor_is_refused_alone(files, tmp_path, capsys):
         code, said = demux(name, mosaic)
         assert code == 3 and "times the light of white" in said
         assert said.count("\n") == 1 and not (tmp_path / "o.h5").exists()
+    loud = [(w, tmp_path / "all.h5") for w in BANDS]
+    with pytest.raises(InputError, match="times the light of white"):
+        run_calibrate(tmp_path / "loud.h5", whites=[white], bands=loud)
     code, said = demux("near.h5", shot * np.float32(1e9))
     assert code == 0 and "no description of the camera" in said
 

@@ -13,7 +13,13 @@ from plenocli.base.progress import bar, note
 from plenocli.base.text import by
 from plenocli.forward.sensor.cfa import doubted_array
 from plenocli.forward.sensor.detector import ROUNDING, SensorModel
-from plenocli.forward.sensor.frames import bad_pixels, make_dark, merge, photon_transfer
+from plenocli.forward.sensor.frames import (
+    bad_pixels,
+    make_dark,
+    merge,
+    photon_transfer,
+    require_in_reach,
+)
 from plenocli.forward.sensor.noise import Noise
 from plenocli.inverse.calibration.calibration import (
     Calibration,
@@ -435,11 +441,13 @@ def _response(
     """
     white, dark, bad = light
     reference, wavelengths = white.exposure_s, bands.wavelengths
+    brightest = max(float(np.nanmax(white.mosaic)), 1e-30)
     gathered = GatheredResponses(windows, grid.valid, len(wavelengths))
     for k, wavelength in enumerate(bar(wavelengths, len(wavelengths), "bands")):
         group = bands.captures(wavelength)
         for capture in group:
             require_alike(capture, white)
+            require_in_reach(capture.mosaic, capture.metadata.path, brightest)
         check_exposure_times([white, *group])
         noise = _told_by(group, dark, noise)
         shares = [

@@ -101,6 +101,8 @@ IMPOSSIBLE = [
     ("capture.h5", RECONSTRUCT, attribute("capture", "scene_shape", 0)),
     ("capture.h5", RECONSTRUCT, values("capture/mosaic", lambda v: v * 1e300)),
     ("calibration.h5", DEMUX, values("response/F", lambda v: v.astype(float) * 1e300)),
+    ("calibration.h5", DEMUX, values("response/F", lambda v: v * 0)),
+    ("calibration.h5", DEMUX, values("response/F", lambda v: v * np.float32(1e20))),
     ("calibration.h5", DEMUX, values("response/F", lambda v: v * 1e-40)),
     ("calibration.h5", DEMUX, values("response/F", lambda v: v * np.nan)),
     ("calibration.h5", DEMUX, values("response/wavelength", lambda v: v * 1e300)),

@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from plenocli.base.budget import budget
-from plenocli.base.errors import ConfigError, NumericsError, UsageError
+from plenocli.base.errors import ConfigError, InputError, NumericsError, UsageError
 from plenocli.base.progress import note
 from plenocli.base.tiling import FORGETFUL, Keeper, kept
+from plenocli.forward.sensor.frames import REACH
 from plenocli.inverse.registration.alignment import align, believed, doubtful, misfit_told
 from plenocli.inverse.spectra.bands import by_filter, by_state
 from plenocli.inverse.spectra.crosstalk import METHODS as NEIGHBOURLY
@@ -96,11 +97,18 @@ class Demultiplexer:
         keeper: of what follows from the calibration and takes long.
 
         Raises UsageError where a method needs a camera that there is none of, ConfigError for one
-            that tells no neighbours' light.
+            that tells no neighbours' light, InputError for a response that is no sensor's.
         """
         calibration = by_state(calibration)
         if ratio:
             calibration = by_filter(calibration, camera)
+        brightest = LensletResponses.of(calibration).brightest
+        if not 0 < brightest <= REACH:
+            raise InputError(
+                f"the calibration's response has pixels of {brightest:.2g} for a light of 1, as no "
+                "sensor has",
+                fix="calibrate again",
+            )
         self.method, self.register, self.ratio = method, register, ratio
         self.neighbours = self._neighbours(calibration, camera)
         self.moving = _moving(calibration, self.neighbours)

@@ -219,7 +219,7 @@ class LensletResponses:
     @cached_property
     def brightest(self) -> float:
         """What the brightest pixel of a typical superpixel shows of a white of radiance 1."""
-        return float(np.nansum(np.clip(self.typical, 0, None), axis=1).max()) or 1.0
+        return float(np.nansum(np.clip(self.typical, 0, None), axis=1).max())
 
     @cached_property
     def sampled_pixels(self) -> tuple[np.ndarray, np.ndarray]:

@@ -118,6 +118,8 @@ IMPOSSIBLE = [
     ("calibration.h5", DEMUX, attribute("response", "gain_e_per_dn", 0.0)),
     ("calibration.h5", DEMUX, attribute("response", "exposure_s", -1.0)),
     ("pif.h5", SIMULATE, values("pif/wavelength", lambda v: v * 1e300)),
+    ("pif.h5", SIMULATE, values("pif/A", lambda v: v * np.float32(1e30))),
+    ("pif.h5", SIMULATE, values("pif/column_energy", lambda v: v * 1e30)),
     ("dictionary.h5", BY_DICTIONARY, attribute("dictionary", "parameters", "{}")),
     ("dictionary.h5", BY_DICTIONARY, attribute("dictionary", "parameters", "[]")),
     ("dictionary.h5", BY_DICTIONARY, values("dictionary/atoms", lambda v: v * 0 + 1e300)),
@@ -137,6 +139,7 @@ IMPOSSIBLE = [
     ("calibration.h5", DEMUX, values("response/wavelength", lambda v: v * 1e-10)),
     ("stack.h5", SIMULATE, values("planes/distance", lambda v: v - v[0])),
     ("kernels.h5", VOLUME, values("stack/lenslet_offset", lambda v: v * 0 + 1)),
+    ("kernels.h5", VOLUME, values("stack/A", lambda v: v * np.float32(1e30))),
     ("kernels.h5", VOLUME, values("stack/spacing", lambda v: v * 0 + 1e-300)),
     ("kernels.h5", VOLUME, values("stack/lenslet_offset", lambda v: np.full_like(v, -(2**31)))),
     (

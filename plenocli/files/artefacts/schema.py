@@ -45,7 +45,7 @@ class Field:
     unit, doc: for the file and for people.
     optional: whether it may be left out.
     maskable: whether NaN marks "not measured".
-    minimum: least value, or None.
+    minimum, maximum: least and largest value, or None.
     ascending: whether each value is above the one before.
     compress: whether it is stored in compressed chunks, not as one run of numbers.
     """
@@ -58,6 +58,7 @@ class Field:
     optional: bool = False
     maskable: bool = False
     minimum: float | None = None
+    maximum: float | None = None
     ascending: bool = False
     compress: bool = True
 
@@ -200,7 +201,7 @@ def value_problems(
     schema: Schema, data: Mapping[str, np.ndarray], others: Collection[str] = ()
 ) -> list[str]:
     """Every way in which the values of `data` (path -> array) break the table: NaN, infinities,
-    below minimum, beyond FURTHEST, order, and what must hold between datasets.
+    below minimum, above maximum, beyond FURTHEST, order, and what must hold between datasets.
 
     others: paths of datasets that there are, too, whose values are not at hand.
     """
@@ -222,6 +223,8 @@ def value_problems(
             problems.append(f"dataset '{path}' holds values beyond {FURTHEST:g}")
         if entry.minimum is not None and low < entry.minimum:
             problems.append(f"dataset '{path}' goes down to {low:.6g}, below {entry.minimum:g}")
+        if entry.maximum is not None and high > entry.maximum:
+            problems.append(f"dataset '{path}' goes up to {high:.6g}, above {entry.maximum:g}")
         if entry.ascending and values.size > 1 and not (np.diff(values) > 0).all():
             problems.append(f"dataset '{path}' does not ascend")
     return problems + [said for rule in schema.rules if (said := rule(data, {*data, *others}))]

@@ -14,6 +14,8 @@ from plenocli.base.progress import note
 
 CHANCE = 5.0
 """Standard errors of the mean light up to which it is none."""
+FEW = 1e-4
+"""Share of saturated pixels, such as hot ones, that goes without saying."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,7 +61,7 @@ class Light:
 
     def told(self) -> str | None:
         """What is wrong, None where nothing is."""
-        if self.saturated:
+        if self.saturated > FEW:
             return (
                 f"{self.saturated:.2%} of the pixels are saturated: what was brighter is unknown; "
                 "expose shorter"

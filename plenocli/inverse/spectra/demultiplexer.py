@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
@@ -81,6 +82,7 @@ class Demultiplexer:
         threads: int = 1,
         several: bool = True,
         keeper: Keeper = FORGETFUL,
+        where: str | os.PathLike | None = None,
     ) -> None:
         """Factor a calibration.
 
@@ -95,6 +97,7 @@ class Demultiplexer:
         threads: for factoring the response.
         several: whether many captures follow; for one, less is kept in memory.
         keeper: of what follows from the calibration and takes long.
+        where: file of the calibration, for messages.
 
         Raises UsageError where a method needs a camera that there is none of, ConfigError for one
             that tells no neighbours' light, InputError for a response that is no sensor's.
@@ -105,9 +108,9 @@ class Demultiplexer:
         brightest = LensletResponses.of(calibration).brightest
         if not 0 < brightest <= REACH:
             raise InputError(
-                f"the calibration's response has pixels of {brightest:.2g} for a light of 1, as no "
-                "sensor has",
-                fix="calibrate again",
+                f"has a response of {brightest:.2g} to a light of 1, as no sensor does",
+                where or "the calibration",
+                "calibrate again",
             )
         self.method, self.register, self.ratio = method, register, ratio
         self.neighbours = self._neighbours(calibration, camera)

@@ -339,6 +339,7 @@ class CaptureDemultiplexer:
                 threads=threads,
                 several=several or settings.reference is not None,
                 keeper=self.keeper,
+                where=calibration,
             )
         self.reference: Spectra | None = None
         if settings.reference is not None:

@@ -46,4 +46,8 @@ def test_saturation_comes_first():
     over = np.zeros(SHAPE, bool)
     over[:6] = True
     assert "10.00% of the pixels are saturated" in told(np.full(SHAPE, 100.0), over)
-    assert told(40 + noise(), np.zeros(SHAPE, bool)) == ""
+    over[:] = False
+    assert told(40 + noise(), over) == ""
+    over[0, 0] = True  # one of 4,200 counts, one hot pixel of 42,000 does not
+    assert "saturated" in told(40 + noise(), over)
+    assert Light.of([(40 + noise(n), over & (n == 0)) for n in range(10)]).told() is None

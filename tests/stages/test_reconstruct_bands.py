@@ -213,11 +213,14 @@ def test_another_light_is_told(folder, tmp_path, capsys):
 
 @pytest.mark.slow
 def test_bands_with_the_neighbours_light(folder, tmp_path):
+    """By the exact model, and at a noise that hides what four bands in place of 21 are off by
+    (0.9 %): of a matrix that is not believed, Tikhonov's detail is drawn back to the means.
+    """
     camera, joined = (
         str(folder / "camera.toml"),
         [
             "--model",
-            "fresnel",
+            "exact",
             "--accuracy",
             "1e-2",
             "--superpixels",
@@ -237,7 +240,7 @@ def test_bands_with_the_neighbours_light(folder, tmp_path):
                 "--scene",
                 "skimage:astronaut",
                 "--snr",
-                "50dB",
+                "40dB",
                 "--seed",
                 "1",
                 "-o",
@@ -260,8 +263,8 @@ def test_bands_with_the_neighbours_light(folder, tmp_path):
             assert 0.6 < np.sqrt(np.mean(image.data["image/sigma"] ** 2)) / error[name] < 1.6
     # alone, the neighbours' light is taken for noise
     assert (
-        error["joint"] < 0.65 * error["alone"]
-        and error["joint"] < 0.12
+        error["joint"] < 0.66 * error["alone"]
+        and error["joint"] < 0.13
         and error["tikhonov"] < 1.15 * error["joint"]
         and error["pnp"] < error["joint"]
     ), error

@@ -21,17 +21,13 @@ SQUARE_STEPS = np.array([(1, 0), (-1, 0), (0, 1), (0, -1)])
 HEXAGONAL_STEPS = np.array([(1, 0), (-1, 0), (0, 1), (0, -1), (1, -1), (-1, 1)])
 
 
-def autocorrelation(
-    image: np.ndarray, contrast: np.ndarray | None = None
-) -> tuple[np.ndarray, np.ndarray]:
+def autocorrelation(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Autocorrelation of an image after removal of a quadratic trend, 1 at zero lag.
 
     The image is tapered (Hann) and every lag is divided by the taper's own overlap, so that peaks
     of a periodic image keep their height. Unlike a Fourier peak, an autocorrelation peak does not
     vanish where the form factor of a single lenslet has a zero.
     image: (row, column).
-    contrast: like image, how much of its repeats is seen where, by which it is judged: dark parts
-        of a scene then do not prefer lags from one bright part to another. None: alike everywhere.
 
     Returns the correlation (lag, lag) and the overlap, zero lag in the middle, lags up to half the
     image.
@@ -48,8 +44,7 @@ def autocorrelation(
         return fft.irfft2(spectrum.real**2 + spectrum.imag**2, shape)
 
     half = (rows // 2, columns // 2)
-    counted = taper if contrast is None else taper * (contrast / max(float(contrast.max()), 1e-30))
-    overlap = _centre(correlate(counted.astype(np.float32)), half)
+    overlap = _centre(correlate(taper.astype(np.float32)), half)
     value = _centre(correlate((flat * taper).astype(np.float32)), half)
     value = value / np.maximum(overlap, 1e-3 * overlap.max())
     peak = value[half]
@@ -73,15 +68,15 @@ class Periodicity:
     reason: str = ""
 
 
-def find_basis(image: np.ndarray, contrast: np.ndarray | None = None) -> Periodicity:
+def find_basis(image: np.ndarray) -> Periodicity:
     """The two shortest independent vectors of the lattice in an image, by its autocorrelation; the
     search covers lags of 4.5 to 330 px that fit into 0.48 of the image.
 
-    image: (row, column); contrast: as of autocorrelation.
+    image: (row, column).
     """
     from scipy import ndimage
 
-    value, overlap = autocorrelation(image, contrast)
+    value, overlap = autocorrelation(image)
     centre = np.array(value.shape) // 2
     lag = np.indices(value.shape) - centre[:, None, None]
     radius = np.hypot(*lag)

@@ -15,8 +15,10 @@ SCALES = (4, 8, 16, 32, 64)
 """px of Gaussians that take the scene off before repeats are looked for."""
 AGREE = 0.03
 """By which the pitch of another scale or direction may differ."""
-AROUND = 8
-"""Times such a scale: side of the squares over which the contrast of what is left is told."""
+NOISE = 0.2
+"""Of the mean contrast of what is left, which is added to that about a pixel before it is divided
+by: dark noise then stays less than lenslets.
+"""
 DARK = 0.02
 """Of the usual light, which is no light."""
 HALF = 0.5
@@ -147,6 +149,19 @@ def even_light(image: np.ndarray, pitch: float) -> np.ndarray:
     return (out / (out + HALF)).astype(np.float32)
 
 
+def _even_contrast(logarithm: np.ndarray, scale: int) -> np.ndarray:
+    """What a Gaussian of `scale` px takes off the logarithm of an image (row, column), over its
+    contrast about each pixel: hard borders of a scene would outdo lenslets, and lags from one part
+    of high contrast to another be preferred to the lattice's.
+    """
+    from scipy.ndimage import gaussian_filter, uniform_filter
+
+    detail = logarithm - gaussian_filter(logarithm, scale)
+    power = uniform_filter(uniform_filter(detail**2, scale), scale)
+    contrast = np.sqrt(np.maximum(power, 0))
+    return detail / (contrast + NOISE * contrast.mean() + np.finfo(np.float32).tiny)
+
+
 def _without_colours(picture: np.ndarray, cfa: str) -> np.ndarray:
     return picture if cfa == "mono" else template.smoothed(picture)
 
@@ -159,17 +174,13 @@ def _period(pictures: Sequence[np.ndarray]) -> lattice.Periodicity:
     """The period that stands out most where slow changes of brightness are taken off, and does so
     at two scales at least; as long in one direction as in the other, which a scene's is not.
     """
-    from scipy.ndimage import gaussian_filter, uniform_filter
-
     found: list[tuple[int, lattice.Periodicity]] = []
     reason = "no period is the same at two scales and in two directions"
     for number, picture in enumerate(pictures):
         part = np.maximum(white_image.brightest_crop(picture, 1024), 0)
         logarithm = np.log(part + DARK * part.mean())
         for scale in SCALES:
-            detail = logarithm - gaussian_filter(logarithm, scale)
-            power = uniform_filter(uniform_filter(detail**2, AROUND * scale), AROUND * scale)
-            seen = lattice.find_basis(detail, np.sqrt(np.maximum(power, 0)))
+            seen = lattice.find_basis(_even_contrast(logarithm, scale))
             if seen.basis is not None and np.ptp(np.hypot(*seen.basis.T)) < AGREE * _pitch(seen):
                 found.append((number, seen))
     for _, best in sorted(found, key=lambda one: -one[1].strength):

@@ -23,6 +23,12 @@ DARK = 0.02
 """Of the usual light, which is no light."""
 HALF = 0.5
 """Of the mean light of a cell, which counts half as much as any highlight."""
+ACROSS = 20
+"""Cells a side in which dark lines are looked for: few enough for one pitch to hold in all."""
+LINES = 24
+"""Places across a cell where a line of it may lie."""
+CROSSED = 0.04
+"""Of the mean light, by which lines across cells may be darker than those along their sides."""
 SURE = 2.0
 """Standard deviations from which on lenslets are believed to have moved."""
 
@@ -43,13 +49,16 @@ def find_scene_grid(
     captures: one or several (row, column), without dark, of lenslets that did not move between;
         the rest as plenocli.inverse.grid.detect.find_grid's.
 
-    Raises as find_grid, and NumericsError where no period stands out of the scene.
+    Raises as find_grid, and NumericsError where no period stands out of the scene, or one that is
+    also the scene's.
     docs/model.md, section 9.
     """
     pictures = [white_image.prepare(capture, cfa) for capture in captures]
     period = _period([_without_colours(p, cfa) for p in pictures])
     pitch = _pitch(period)
     evened = np.mean([even_light(_without_colours(p, cfa), pitch) for p in pictures], axis=0)
+    if not parts:
+        _check_sides(evened, period)
     grid = detect.find_grid(
         evened, "mono", None, lattice_kind, near, parts=parts, count=count, scene=period
     )
@@ -168,6 +177,43 @@ def _without_colours(picture: np.ndarray, cfa: str) -> np.ndarray:
 
 def _pitch(found: lattice.Periodicity) -> float:
     return float("nan") if found.basis is None else float(np.hypot(*found.basis.T).min())
+
+
+def _check_sides(image: np.ndarray, found: lattice.Periodicity) -> None:
+    """Refuse a square lattice of every other lenslet, which a scene lights like a chessboard: dark
+    lines between lenslets then run along the diagonals of its cells.
+
+    image: (row, column), evened.
+    """
+    if found.basis is None or lattice.kind_of(found.basis) != "square":
+        return
+    step = max(1, int(_pitch(found) / LINES))
+    part = white_image.brightest_crop(image, round(ACROSS * _pitch(found)))[::step, ::step]
+    basis = found.basis / step
+    sides, diagonals = (
+        _darkest_line(part, one) for one in (basis, np.array([[0.5, 0.5], [0.5, -0.5]]) @ basis)
+    )
+    if diagonals < sides - CROSSED * part.mean():
+        raise NumericsError(
+            f"no lenslet lattice in the capture: it repeats every {_pitch(found):.1f} px, but dark "
+            "lines run across such superpixels, not between them: the scene or filters make every "
+            "other lenslet or part of one brighter",
+            fix="give a capture of another scene, a white image, or the camera with its filters",
+        )
+
+
+def _darkest_line(image: np.ndarray, basis: np.ndarray) -> float:
+    """Light on the darkest lines of an image (row, column) along the two vectors of a lattice,
+    basis (2, 2) px, all cells laid on one another: the mean of both.
+    """
+    at = np.indices(image.shape).reshape(2, -1).T @ np.linalg.inv(basis)
+    darkest = []
+    for place in at.T:
+        line = (place % 1 * LINES).astype(int)
+        count = np.bincount(line)  # where pixels and cells share a step some hold no pixel
+        light = np.bincount(line, image.ravel())
+        darkest.append((light[count > 0] / count[count > 0]).min())
+    return float(np.mean(darkest))
 
 
 def _period(pictures: Sequence[np.ndarray]) -> lattice.Periodicity:

@@ -230,7 +230,8 @@ def _period(pictures: Sequence[np.ndarray]) -> lattice.Periodicity:
             if seen.basis is not None and np.ptp(np.hypot(*seen.basis.T)) < AGREE * _pitch(seen):
                 found.append((number, seen))
     for _, best in sorted(found, key=lambda one: -one[1].strength):
-        alike = [n for n, one in found if abs(_pitch(one) / _pitch(best) - 1) < AGREE]
-        if len(alike) > len(set(alike)):  # one picture at two scales, whatever others show
-            return best
+        alike = [(n, one) for n, one in found if abs(_pitch(one) / _pitch(best) - 1) < AGREE]
+        if len(alike) > len({n for n, _ in alike}):  # one picture at two scales, whatever others
+            # what is slow in a scene correlates half way, too, and passed for parts
+            return replace(best, structure=min(one.structure for _, one in alike))
     raise NumericsError(f"no lenslet lattice in the capture: {reason}", fix=white_image.FIX)

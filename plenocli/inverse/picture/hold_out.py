@@ -57,9 +57,9 @@ class HeldOut(Record):
     @property
     def sentence(self) -> str:
         """For a person."""
-        which = "in lenslets that show something" if self.structured else "in all lenslets"
+        which = "lenslets that show something" if self.structured else "all lenslets"
         return (
-            f"patches of {self.patch} x {self.patch} pixels {which} predicted within "
+            f"patches of {self.patch} x {self.patch} pixels left out of {which}, predicted within "
             f"{self.model:.2%} of white (noise {self.noise:.2%}), by the pixels around over white "
             f"{self.neighbours_over_white:.2%}"
         )

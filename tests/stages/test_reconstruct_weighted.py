@@ -26,7 +26,8 @@ def test_pixels_are_left_out_and_told(tmp_path, monkeypatch, capsys):
     # the line for a person has the widest patches alone
     widest = told["held_out"][-1]
     assert (
-        "patches of 4 x 4 pixels in lenslets that show something predicted within " in told["rule"]
+        "patches of 4 x 4 pixels left out of lenslets that show something, predicted within "
+        in told["rule"]
     )
     assert f"{widest['model']:.2%} of white" in told["rule"] and len(told["rule"]) < 300
     data = read_artefact(tmp_path / "picture.h5", ("image",)).data

@@ -41,10 +41,10 @@ def prepare(
         image -= np.asarray(dark, np.float32)
     if not np.isfinite(image).all():
         raise InputError("the white image holds values that are not finite")
-    if np.abs(image).max() > REACH:
+    most = float(max(image.max(), -image.min()))
+    if most > REACH:
         raise InputError(
-            f"the white image, or what is taken off it, holds {np.abs(image).max():.2g}: no sensor "
-            "counts so far",
+            f"the white image, or what is taken off it, holds {most:.2g}: no sensor counts so far",
             fix="give it, and the dark image, as the sensor counts",
         )
     if np.ptp(image) <= 0:

@@ -105,7 +105,8 @@ class Demultiplexer:
         calibration = by_state(calibration)
         if ratio:
             calibration = by_filter(calibration, camera)
-        brightest = LensletResponses.of(calibration).brightest
+        responses = LensletResponses.of(calibration)
+        brightest = responses.brightest
         if not 0 < brightest <= REACH:
             raise InputError(
                 f"has a response of {brightest:.2g} to a light of 1, as no sensor does",
@@ -116,7 +117,7 @@ class Demultiplexer:
         self.neighbours = self._neighbours(calibration, camera)
         self.moving = _moving(calibration, self.neighbours)
         self._displaced: dict[tuple[float, ...], NeighbourLight] = {}
-        prior = partial(light_prior, LensletResponses.of(calibration), known)
+        prior = partial(light_prior, responses, known)
         found = kept(keeper, "prior", lambda: prior() or ())
         self.prior = (found[0], found[1]) if found else None
         # its superpixels, one for every lenslet, have served
